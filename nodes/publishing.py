@@ -29,16 +29,6 @@ class PartStatus(NamedTuple):
     ages_s: Mapping[str, float] = MappingProxyType({})
 
 
-def publish_status(publisher: Publisher, status: Status, timeout_s: float = 30.0) -> None:
-    """As of ``Publisher.publish``; a status that cannot be sent is no reason for a node to end."""
-    try:
-        parts = encode(status)
-    except CodecError as error:
-        _log.error("status_not_reported", reason=str(error))
-        return
-    publisher.publish(parts, timeout_s)
-
-
 class StatusReport:
     """Publishes how a node of this name is, about once a second."""
 
@@ -52,14 +42,18 @@ class StatusReport:
         """Whether it is time to."""
         return time.monotonic() - self._last >= STATUS_PERIOD_S
 
-    def publish(self, state: NodeState, *parts: PartStatus) -> Status:
-        """Publish it now, all parts together; what was published."""
+    def publish(self, state: NodeState, *parts: PartStatus, timeout_s: float = 30.0) -> Status:
+        """Publish it now, all parts together, as of ``Publisher.publish``; what was published. A status that cannot be
+        sent is no reason for a node to end."""
         self._last = time.monotonic()
         counters = {name: count for part in parts for name, count in part.counters.items()}
         ages_s = {name: age for part in parts for name, age in part.ages_s.items()}
         warnings = tuple(warning for part in parts for warning in part.warnings if warning)
         status = Status(self._node, state, time.monotonic_ns(), counters, ages_s, warnings)
-        publish_status(self._publisher, status)
+        try:
+            self._publisher.publish(encode(status), timeout_s)
+        except CodecError as error:
+            _log.error("status_not_reported", reason=str(error))
         return status
 
 

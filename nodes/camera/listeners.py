@@ -4,33 +4,19 @@ from __future__ import annotations
 
 import time
 
-from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 DRAIN_S = 600.0  # how long subscribers may take to work off what waits for them after the last frame
-WAIT_SLICE_S = 0.2
 START_S = 180.0  # how long subscribers may take to start
 STOP_DRAIN_S = 3.0  # the same after a stop request
 REMIND_S = 2.0  # how often the end is said again meanwhile
 
 
 def wait_for_listeners(context: NodeContext, publisher: Publisher, acks: LosslessSubscriber | None = None) -> bool:
-    """Wait until all others are there, in slices: False where a stop request came first.
-
-    Raises TransportError: too few within the time.
-    """
-    deadline = time.monotonic() + START_S
-    while not context.stop:
-        try:
-            publisher.wait_for_subscribers("frame", context.subscribers, WAIT_SLICE_S)
-            if acks is not None:
-                acks.wait_until_heard(WAIT_SLICE_S)
-            return True
-        except TransportError:
-            if time.monotonic() > deadline:
-                raise
-    return False
+    """Wait until all others are there: False where a stop request came first. ``TransportError``: too few in time."""
+    there = publisher.wait_for_subscribers("frame", context.subscribers, START_S, context.stop)
+    return there and (acks is None or acks.wait_until_heard(START_S, context.stop))
 
 
 def drain(context: NodeContext, publisher: Publisher) -> None:

@@ -24,13 +24,12 @@ from semantic_mapper.nodes.camera.corrections import CorrectionSender, without_l
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera, table_of
-from semantic_mapper.nodes.publishing import publish_status
+from semantic_mapper.nodes.publishing import PartStatus, StatusReport
 from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState, Status
+from semantic_mapper.transport.messages import EndOfStream, EndReason, NodeState
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import PosedFrame
 
-STATUS_PERIOD_S = 1.0
 POLL_S = 0.05  # how soon a stop request is passed on
 SEND_SLICE_S = 0.2  # between two looks at whether to stop, while a reader has no room for the next frame
 FIRST_PAUSE_S = 0.2  # before a camera that could not be opened is tried again; doubles each time
@@ -42,12 +41,10 @@ _log = structlog.get_logger(__name__)
 def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCamera) -> None:
     """Publish a camera's frames until it ends (a video) or somebody asks to stop.
 
-    Raises:
-        ConfigError: of the camera or of the poses: unknown keys, wrong values; or the node is to be restarted, and
-            the world of its poses would be another one then.
-        CameraError: the camera can never work with its config, or was not there within ``open_s``.
-        DependencyError: the kind needs something that is not installed.
-        TransportError: the endpoint is taken.
+    Raises ConfigError: of the camera or of the poses: unknown keys, wrong values; or the node is to be restarted, and
+    the world of its poses would be another one then. CameraError: the camera can never work with its config, or was not
+    there within ``open_s``. DependencyError: the kind needs something that is not installed. TransportError: the
+    endpoint is taken.
     """
     policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
     if context.restartable:
@@ -75,10 +72,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
 
 
 def check_world(name: str, live: LiveCamera) -> None:
-    """A camera without depth that tracks itself must not come back: it could not be found in the map again.
-
-    Raises ConfigError: it is to be restarted.
-    """
+    """Refuse (``ConfigError``) to restart a camera without depth that tracks itself: the map cannot find it again."""
     config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
     if begins_world(poses) and not can_be_found(poses):
@@ -91,19 +85,13 @@ def check_world(name: str, live: LiveCamera) -> None:
 
 
 def make_source(live: LiveCamera) -> PosedCamera:
-    """The camera with its poses, not open yet.
-
-    Raises ConfigError, CameraError, DependencyError: see ``run_live_camera``.
-    """
+    """The camera with its poses, not open yet; errors as of ``run_live_camera``."""
     config, where = table_of(live.config, "camera.config")
     return with_poses(open_camera(live.kind, config, live.id, where), live, config)
 
 
 def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> PosedCamera:
-    """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused.
-
-    Raises ConfigError, CameraError: see ``run_live_camera``.
-    """
+    """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused."""
     config = dict(table_of(live.poses, "camera.poses")[0])
     checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
     poses = read_pose_config(config)
@@ -123,6 +111,7 @@ class _LiveNode:
         self._context = context
         self._options = options
         self._publisher = publisher
+        self._status = StatusReport(context.name, publisher)
         self._note = note  # of the settings; reported with the warnings
         self._waiting_for = ""  # why the camera could not be opened yet
         self._source: PosedCamera | None = None  # once it is open
@@ -237,7 +226,6 @@ class _LiveNode:
             self._in_driver = False
 
     def _run(self) -> None:
-        last_sent = 0.0
         while not self._ended.wait(POLL_S):
             source = self._source
             before, self._last_poll_time = self._last_poll_time, 0.0 if source is None else source.last_poll_time
@@ -245,10 +233,8 @@ class _LiveNode:
                 self._context.heartbeat.turn()
             if self._context.stop and source is not None:
                 source.stop()
-            if time.monotonic() - last_sent >= STATUS_PERIOD_S:
-                last_sent = time.monotonic()
-                warned = bool(self._warnings())
-                running: NodeState = "degraded" if warned else "running"
+            if self._status.due:
+                running: NodeState = "degraded" if self._warnings() else "running"
                 self._report("stopping" if self._context.stop else "starting" if source is None else running)
 
     def _warnings(self) -> tuple[str, ...]:
@@ -263,6 +249,5 @@ class _LiveNode:
         for part in (self._source, self.sender):
             counters |= {} if part is None else part.counters
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
-        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, self._warnings())
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
-            publish_status(self._publisher, status, 0.0)
+            self._status.publish(state, PartStatus(counters, self._warnings(), ages), timeout_s=0.0)

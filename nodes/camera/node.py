@@ -28,11 +28,8 @@ _log = structlog.get_logger(__name__)
 def run_camera(context: NodeContext, options: CameraOptions) -> None:
     """Publish frames to the end of the source, or until stopped.
 
-    Raises:
-        LogError: the log cannot be read.
-        NodeError: lockstep, and the mapper has gone.
-        TransportError: nobody subscribes.
-        CameraError, ConfigError: see ``run_live_camera``.
+    Raises LogError: the log cannot be read. NodeError: lockstep, and the mapper has gone. TransportError: nobody
+    subscribes. CameraError, ConfigError: see ``run_live_camera``.
     """
     if options.camera is not None:
         from semantic_mapper.nodes.camera.live import run_live_camera  # loads GTSAM, which a log has no need of

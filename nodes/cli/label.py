@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.config import AtLeastOne
-from semantic_mapper.errors import LogError, TransportError
+from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Port, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
@@ -132,23 +132,10 @@ def _send(output: Output, log: Path, keyframes: int, images: Path | None, to: st
     with StopRequest() as stop, frame_progress("label", None, stop=stop) as bar:
         found, label_set = choose_keyframes(log, keyframes, images, bar)
         with Publisher(endpoint, policy="block", linger_ms=DELIVERY_MS) as publisher:
-            _wait_for_finetuner(publisher, stop)
+            if not publisher.wait_for_subscribers("keyframe", 1, FINETUNER_S, stop):
+                raise KeyboardInterrupt
             for frame in found.values():
                 publisher.publish(encode(LabelledKeyframe(frame, label_set, f"log {log.name}")))
     output.print(f"{counted(len(found), 'labelled keyframe')} sent: frames {', '.join(map(str, found))} of {log.name}")
     if pseudo := sum(frame.label_is_pseudo for frame in found.values()):
         output.print(f"  {pseudo} of them have pseudo labels (`autolabel`): what weights have rendered, right or wrong")
-
-
-def _wait_for_finetuner(publisher: Publisher, stop: StopRequest) -> None:
-    """Raises: TransportError: none comes; KeyboardInterrupt: a stop request does."""
-    deadline = time.monotonic() + FINETUNER_S
-    while not publisher.subscribers("keyframe"):
-        if stop:
-            raise KeyboardInterrupt
-        if time.monotonic() > deadline:
-            raise TransportError(
-                f"{publisher.endpoint}: no finetuner listens there (waited {FINETUNER_S:g} s); does the launch have "
-                "one, as launch/learning.toml has?"
-            )
-        time.sleep(POLL_S)

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
-from semantic_mapper.errors import CodecError, LogError, TransportError
+from semantic_mapper.errors import CodecError, LogError
 from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
@@ -29,7 +29,6 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics
 
 POLL_S = 0.05
-WAIT_SLICE_S = 0.2
 QUIET_S = 0.5  # after the end of the stream, answers from other nodes may still be on their way
 MAX_WAITING = 256  # messages that may wait to be written, while the disk or the processor is busy
 MAX_EARLY = 1000  # messages kept while no stream has begun
@@ -73,7 +72,7 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
         sources: list[LosslessSubscriber] = []
         if others:
             sources.append(stack.enter_context(LosslessSubscriber(others, topics, hwm=MAX_WAITING)))
-            _wait_until_heard(context, options, sources[0])
+            sources[0].wait_until_heard(options.source_timeout_s, context.stop)
         # Cameras begin once they have all their subscribers, so this one comes last: by now nothing can be missed.
         frames = stack.enter_context(LosslessSubscriber(cameras, topics, hwm=MAX_WAITING))
         sources.insert(0, frames)
@@ -102,18 +101,6 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
     if recorder.recording is not None and recorder.recording.gone:
         raise LogError(f"{recorder.recording.path}: was removed while it was written, and what it held is lost")
     return recorder
-
-
-def _wait_until_heard(context: NodeContext, options: RecorderOptions, answers: LosslessSubscriber) -> None:
-    """Wait, in slices, until the other sources know of us; return early on a stop request."""
-    deadline = time.monotonic() + options.source_timeout_s
-    while not context.stop:
-        try:
-            return answers.wait_until_heard(WAIT_SLICE_S)
-        except TransportError:
-            if time.monotonic() > deadline:
-                raise
-    return None
 
 
 class Recorder:

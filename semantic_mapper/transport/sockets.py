@@ -163,17 +163,20 @@ class Publisher(Closing):
         with self._in_use():
             return sum(count for prefix, count in self._counts.items() if topic.startswith(prefix))
 
-    def wait_for_subscribers(self, name: str, count: int = 1, timeout_s: float = 10.0) -> None:
+    def wait_for_subscribers(self, name: str, count: int = 1, timeout_s: float = 10.0, stop: object = False) -> bool:
         """Block until ``count`` subscriptions to topic ``name`` have arrived, so that no one misses the first message;
-        ``TransportError`` where it takes longer than ``timeout_s``."""
+        False once ``stop`` is true before. ``TransportError`` where it takes longer than ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while (there := self.subscribers(name)) < count:
+            if stop:
+                return False
             if time.monotonic() > deadline:
                 raise TransportError(
                     f"{self.endpoint}: {there} of {count} subscribers of '{name}' after {timeout_s:g} s; "
                     "is the other node running, and does it connect to this endpoint?"
                 )
             self._closed.wait(0.005)
+        return True
 
     def close(self) -> None:
         """Deliver what is still waiting (at most ``linger_ms``), then free the endpoint. Harmless when repeated."""
@@ -320,14 +323,17 @@ class _Subscriber(Closing):
         """Publishers that are connected right now; falls at once when one dies."""
         return self._connections.count
 
-    def wait_until_heard(self, timeout_s: float = 10.0) -> None:
-        """Block until every publisher knows of our subscriptions: what it sends from then on arrives.
-        ``TransportError`` where it takes longer than ``timeout_s``."""
-        count = len(self.endpoints)
+    def wait_until_heard(self, timeout_s: float = 10.0, stop: object = False) -> bool:
+        """Block until every publisher knows of our subscriptions: what it sends from then on arrives. False once
+        ``stop`` is true before. ``TransportError`` where it takes longer than ``timeout_s``."""
+        count, deadline = len(self.endpoints), time.monotonic() + timeout_s
         with self._changed:
-            self._changed.wait_for(lambda: self._synced >= count or bool(self._over), timeout_s)
+            while self._synced < count and not self._over and time.monotonic() < deadline:
+                if stop:
+                    return False
+                self._changed.wait(min(timeout_s, _POLL_MS / 1000))
             if self._synced >= count and not self._over:
-                return
+                return True
             why = self._over or (
                 f"{self._synced} of {count} publishers have answered within {timeout_s:g} s; is the other node running?"
                 + (" Does it know this machine's key, and is its own the one we have?" if self._identity else "")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from structlog.testing import capture_logs
 
-from semantic_mapper.nodes.publishing import publish_status
+from semantic_mapper.nodes.publishing import StatusReport
 from semantic_mapper.transport.codec import decode_as, encode
 from semantic_mapper.transport.messages import MAX_COUNT, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
@@ -32,7 +32,6 @@ def test_a_status_that_cannot_be_sent_is_logged_and_the_next_one_goes_out(tmp_pa
         NewestSubscriber([endpoint], ("status",)) as subscriber,
     ):
         publisher.wait_for_subscribers("status", 1, 30)
-        publish_status(publisher, Status("no such name", "running", 1))
-        publish_status(publisher, Status("eye", "running", 2))
-        assert subscriber.receive(30) == Status("eye", "running", 2)
+        StatusReport("no such name", publisher).publish("running")
+        assert StatusReport("eye", publisher).publish("running") == subscriber.receive(30)
     assert [entry["event"] for entry in told] == ["status_not_reported"]

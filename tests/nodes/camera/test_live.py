@@ -20,6 +20,7 @@ from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, Pose
 from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
+from semantic_mapper.nodes import publishing
 from semantic_mapper.nodes.camera import live as live_camera
 from semantic_mapper.nodes.camera.node import run_camera
 from semantic_mapper.nodes.launcher.liveness import TURN, HeartbeatWriter
@@ -117,7 +118,7 @@ def running(
 @pytest.fixture(autouse=True)
 def _walking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_camera, "with_poses", lambda camera, live, driver: walking(camera))
-    monkeypatch.setattr(live_camera, "STATUS_PERIOD_S", 0.1)
+    monkeypatch.setattr(publishing, "STATUS_PERIOD_S", 0.1)
 
 
 @pytest.fixture
