@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self
 
@@ -47,6 +48,15 @@ class CameraImage:
     # of a device that tracks itself (visual-inertial odometry); None of all others, and while it is lost
     own_pose: PoseEstimate | None = None
     tracks_itself: bool = False  # whether the device does
+
+
+@contextmanager
+def as_camera_error(what: str, fix: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Errors of these kinds within, such as those of a vendor's SDK, become ``CameraError``."""
+    try:
+        yield
+    except kinds as error:
+        raise CameraError(f"{what}: {error}; {fix}") from error
 
 
 class Camera:

@@ -12,7 +12,7 @@ from typing import Self, TypeVar
 import cv2
 import numpy as np
 
-from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.base import Camera, CameraImage, as_camera_error
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
@@ -242,10 +242,8 @@ class CaptureDevice(Device):
     def read(self) -> CameraImage | None:
         """As of ``Device``."""
         self._count += 1
-        try:
+        with as_camera_error(self.info.source, "is it an image or video that OpenCV can read?", cv2.error):
             good, bgr = self._capture.read()
-        except cv2.error as error:
-            raise CameraError(f"{self.info.source}: {error}") from error
         arrived_ns = time.monotonic_ns()
         intrinsics = self._rectify.intrinsics
         if not good or bgr is None:

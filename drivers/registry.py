@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ from semantic_mapper.drivers.base import Camera
 from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
 KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
+SEARCH_S = 2.0  # how long a device is looked for before it counts as missing
+_SEARCH_STEP_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +71,19 @@ def find_cameras(kinds: Sequence[str] = KINDS) -> tuple[list[FoundCamera], dict[
         except (CameraError, DependencyError) as error:
             unknown[kind] = str(error)
     return found, unknown
+
+
+def find_device(search: Callable[[], Mapping[str, Any]], kind: str, address: str, fix: str) -> Any:
+    """The only device that ``search`` finds by name, looked for until it is there.
+
+    Raises CameraError: there is none of this address (empty: of any), or several.
+    """
+    deadline = time.monotonic() + SEARCH_S
+    while not (found := search()) and time.monotonic() < deadline:
+        time.sleep(_SEARCH_STEP_S)
+    if not found:
+        what = f"the {kind} '{address}' is not connected" if address else f"no {kind} camera is connected"
+        raise CameraError(f"{what}, or it is in use: {fix}")
+    if len(found) > 1:
+        raise CameraError(f"several {kind} cameras are connected: {', '.join(found)}; say which one by `device`")
+    return next(iter(found.values()))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.drivers.calibrating.views import (
     CELLS,
@@ -17,12 +16,24 @@ from semantic_mapper.drivers.calibrating.views import (
     CalibrationConfig,
     area_counts,
     shortfalls,
-    tilt_degrees,
+    tilt_radians,
 )
-from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
+from semantic_mapper.drivers.poses.board import board_poses
 from semantic_mapper.errors import CameraError, FrameError
-from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, PANEL, SMALL_PT, TITLE_PT, WARN, cut, new_figure, rendered
+from semantic_mapper.geometry import camera_matrix, make_pose, rotation_vector
+from semantic_mapper.plots import (
+    BAD,
+    DIM_TEXT,
+    GOOD,
+    PANEL,
+    SMALL_PT,
+    TITLE_PT,
+    WARN,
+    cut,
+    hex_color,
+    new_figure,
+    rendered,
+)
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 if TYPE_CHECKING:
@@ -36,7 +47,6 @@ MAX_LEFT_OUT = 0.2  # fraction of the views
 MAX_FOCAL_SIGMA = 0.005  # one sigma of the focal length, as a fraction of it
 _LONGEST = 0.03  # of the image's width, for the 95th percentile of the residuals in the picture
 _MAX_TILT_DEG = 60
-_GOOD, _BAD, _WARN, _DIM, _PANEL = (tuple(v / 255 for v in c) for c in (GOOD, BAD, WARN, DIM_TEXT, PANEL))
 _FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 
 
@@ -45,14 +55,14 @@ class CameraCalibration:
     """A calibrated camera and how it came about."""
 
     intrinsics: CameraIntrinsics  # with distortion
-    estimated: bool  # false where they were given, and only compared with the views
+    # One-sigma uncertainty by name (fx, fy, cx, cy, k1, ...); empty where the intrinsics were given, and only compared
+    sigmas: dict[str, float]
     rms_px: float  # root mean square of the distances of corners, seen and predicted
-    sigmas: dict[str, float]  # One-sigma uncertainty by name (fx, fy, cx, cy, k1, ...); empty where they were given
     views: tuple[BoardView, ...]  # those used
     residuals: tuple[Float64, ...]  # (N, 2) a view, seen minus predicted, pixels
     errors_px: tuple[float, ...]  # RMS of each view
-    tilts: Float64  # (V, 2) degrees; counts: corners a cell; see ``views``
-    counts: NDArray[np.int64]
+    tilts: Float64  # (V, 2) degrees: how the board leaned up or down and to a side
+    counts: Float64  # corners a cell; see ``views``
     left_out: tuple[str, ...] = ()  # names of views that did not fit the others
 
 
@@ -63,8 +73,7 @@ def calibrate_camera(
 
     Raises CameraError: the views cover too little, do not fit each other, or leave the focal length open; says which.
     """
-    counts = area_counts([v.pixels for v in views], size)
-    _refuse(camera_id, shortfalls(config, len(views), counts, None))
+    _refuse(camera_id, shortfalls(config, len(views), area_counts(views, size), None))
     left_out: list[str] = []
     used = list(views)
     found = _calibrate(used, size, config)
@@ -78,15 +87,8 @@ def calibrate_camera(
         left_out += [used[i].name for i in worst]
         used = [view for i, view in enumerate(used) if i not in worst]
         found = _calibrate(used, size, config)
-    _refuse(camera_id, shortfalls(config, len(found.views), found.counts, found.tilts))
-    _check_error(camera_id, found, config)
-    fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
-    if fraction > MAX_FOCAL_SIGMA:
-        lack = (
-            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
-            "needed): show the board nearer, and lean it further, in more images"
-        )
-        _refuse(camera_id, (lack,))
+    lacks = shortfalls(config, len(found.views), found.counts, found.tilts)
+    _refuse(camera_id, [*lacks, *_inexact(found, config)])
     return replace(found, left_out=tuple(left_out))
 
 
@@ -97,9 +99,9 @@ def compare_camera(
     ideal = replace(intrinsics, distortion=())
     used = [(v, p[0][1]) for v in views if (p := board_poses(v.points, ideal_pixels(v.pixels, intrinsics), ideal))]
     if not used:
-        _refuse(camera_id, ("the board was seen in none of its images",))
+        _refuse(camera_id, ["the board was seen in none of its images"])
     result = _gather(intrinsics, {}, [view for view, _ in used], [pose for _, pose in used])
-    _check_error(camera_id, result, config)
+    _refuse(camera_id, _inexact(result, config))
     return result
 
 
@@ -131,42 +133,51 @@ def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: Calibr
             f"the views lead to no possible camera: {error}; are board and its sizes the right ones, and is it flat?"
         ) from error
     names = ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES[: config.coefficients])
-    sigma_by_name: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
-    poses = list(np.reshape(np.concatenate((turns, shifts), axis=1), (-1, 6)).astype(np.float64))
+    sigma_by_name = {name: float(sigma) for name, sigma in zip(names, np.ravel(sigmas), strict=False)}
+    poses = [make_pose(np.ravel(turn), np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
     return _gather(intrinsics, sigma_by_name, views, poses)
 
 
 def _gather(
     intrinsics: CameraIntrinsics, sigmas: dict[str, float], views: Sequence[BoardView], poses: Sequence[Float64]
 ) -> CameraCalibration:
-    """Of views with the poses (6,) of the board in them; without ``sigmas`` the intrinsics are given ones."""
-    residuals = tuple(v.pixels - _project(v.points, pose, intrinsics) for v, pose in zip(views, poses, strict=True))
+    """Of views with T_camera_board (4, 4) of each; without ``sigmas`` the intrinsics are given ones."""
+    K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4, np.float64)
+    seen = [
+        cv2.projectPoints(v.points, rotation_vector(T), T[:3, 3], K, lens)[0] for v, T in zip(views, poses, strict=True)
+    ]
+    residuals = tuple(v.pixels - np.reshape(pixels, (-1, 2)) for v, pixels in zip(views, seen, strict=True))
     return CameraCalibration(
         intrinsics,
-        bool(sigmas),
-        float(np.sqrt((np.concatenate(residuals) ** 2).sum(axis=1).mean())),
         sigmas,
+        _rms(np.concatenate(residuals)),
         tuple(views),
         residuals,
-        tuple(float(np.sqrt((r**2).sum(axis=1).mean())) for r in residuals),
-        np.array([tilt_degrees(pose_of_vector(pose)) for pose in poses]),
-        area_counts([v.pixels for v in views], (intrinsics.width, intrinsics.height)),
+        tuple(_rms(r) for r in residuals),
+        np.degrees([tilt_radians(pose) for pose in poses]),
+        area_counts(views, (intrinsics.width, intrinsics.height)),
     )
 
 
-def _project(points: Float64, pose: Float64, intrinsics: CameraIntrinsics) -> Float64:
-    lens = np.array(intrinsics.distortion or (0.0,) * 4, np.float64)
-    seen, _ = cv2.projectPoints(points, pose[:3], pose[3:], camera_matrix(intrinsics), lens)
-    return np.asarray(seen, np.float64).reshape(-1, 2)
+def _rms(residuals: Float64) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def _check_error(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> None:
+def _inexact(found: CameraCalibration, config: CalibrationConfig) -> list[str]:
+    """Why a result is too inexact to be used, and what to do."""
+    lacks: list[str] = []
     if found.rms_px > config.max_error_px:
-        lack = (
+        lacks.append(
             f"corners are off by {found.rms_px:.2f} px (RMS; {config.max_error_px:g} are allowed): check the sizes of "
             "the board, glue it to something flat, hold it still, and use sharp images"
         )
-        _refuse(camera_id, (lack,))
+    fraction = max(found.sigmas.get(name, 0.0) / getattr(found.intrinsics, name) for name in ("fx", "fy"))
+    if fraction > MAX_FOCAL_SIGMA:
+        lacks.append(
+            f"the focal length is known to {100 * fraction:.2f} % only (one sigma; {100 * MAX_FOCAL_SIGMA:g} % is "
+            "needed): show the board nearer, and lean it further, in more images"
+        )
+    return lacks
 
 
 def _refuse(camera_id: str, lacks: Sequence[str]) -> None:
@@ -189,43 +200,40 @@ def draw_calibration(camera_id: str, found: CameraCalibration) -> Figure:
 
 def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
     """The image with its cells, the corners, and their residuals enlarged."""
-    i = found.intrinsics
+    i, dim, panel = found.intrinsics, hex_color(DIM_TEXT), hex_color(PANEL)
     values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
     sigmas = {name: f" ± {found.sigmas[name]:.2f}" if name in found.sigmas else "" for name in values}
     axes.set_title(",  ".join(f"{name} {value:.2f}{sigmas[name]}" for name, value in values.items()))
-    right, bottom = i.width - 0.5, i.height - 0.5
-    edges = np.linspace(-0.5, right, CELLS + 1), np.linspace(-0.5, bottom, CELLS + 1)
-    seen = np.where(found.counts > 0, 0.12, 0.0)
-    axes.imshow(np.dstack([np.ones((CELLS, CELLS, 3)), seen]), extent=(-0.5, right, bottom, -0.5), aspect="equal")
-    label = {"color": _DIM, "zorder": 5, "bbox": {"facecolor": _PANEL, "linewidth": 0, "pad": 1}}
+    x, y = (np.linspace(-0.5, side - 0.5, CELLS + 1) for side in (i.width, i.height))
+    axes.pcolormesh(x, y, found.counts > 0, cmap="gray", vmin=-1, vmax=6, edgecolors=panel, linewidth=1.5)
     for (row, column), count in np.ndenumerate(found.counts):
-        place = edges[0][column], edges[1][row]
-        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", fontsize=SMALL_PT, **label)
+        style = {
+            "fontsize": SMALL_PT,
+            "color": dim,
+            "bbox": {"facecolor": panel, "linewidth": 0, "pad": 1},
+            "zorder": 5,
+        }
+        axes.annotate(f"{count:.0f}", (x[column], y[row]), (4, -4), textcoords="offset points", va="top", **style)
     pixels = np.concatenate([view.pixels for view in found.views])
     residuals = np.concatenate(found.residuals)
     lengths = np.linalg.norm(residuals, axis=1)
     longest = max(float(np.percentile(lengths, 95)), 1e-6)
     enlarged = _LONGEST * i.width / longest
-    colors = np.where((lengths <= longest)[:, None], _GOOD, _BAD)
+    colors = np.where(lengths <= longest, hex_color(GOOD), hex_color(BAD))
     style = {"angles": "xy", "scale_units": "xy", "width": 0.0015, "headwidth": 1, "headlength": 0, "headaxislength": 0}
     axes.quiver(*pixels.T, *residuals.T, color=colors, scale=1 / enlarged, **style)
     axes.plot(*pixels.T, ".", color="white", markersize=2.5)
-    axes.set(xticks=edges[0], yticks=edges[1], xlim=(-0.5, right), ylim=(bottom, -0.5))
-    axes.tick_params(length=0, labelbottom=False, labelleft=False)
-    axes.set_axisbelow(False)
-    axes.grid(color=_PANEL, linewidth=1.5)
+    axes.set(xticks=(), yticks=(), xlim=x[[0, -1]], ylim=y[[-1, 0]], aspect="equal")
     note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
     axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
 
 
 def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
-    from matplotlib.ticker import MaxNLocator
-
     left_out = f", {len(found.left_out)} left out" if found.left_out else ""
     axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
-    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=_GOOD)
-    axes.axhline(found.rms_px, color=_WARN, label=f"all corners: {found.rms_px:.2f}")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=hex_color(GOOD))
+    axes.axhline(found.rms_px, color=hex_color(WARN), label=f"all corners: {found.rms_px:.2f}")
+    axes.locator_params(axis="x", integer=True)
     axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
     axes.legend(loc="upper right")
 
@@ -233,10 +241,10 @@ def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
 def _draw_tilts(axes: Axes, found: CameraCalibration) -> None:
     """How the board leaned in each view, and how far it has to have leaned at least once."""
     up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
-    least, ticks = MIN_TILT_DEG, range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
-    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * least
-    axes.plot(*square.T, "-", color=_WARN, linewidth=1, label=f"needed: beyond {least:g}° each way")
-    axes.plot(side, up, "o", color=_GOOD)
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * MIN_TILT_DEG
+    axes.plot(*square.T, color=hex_color(WARN), linewidth=1, label=f"needed: beyond {MIN_TILT_DEG:g}° each way")
+    axes.plot(side, up, "o", color=hex_color(GOOD))
+    ticks = range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
     axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
     axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
     axes.legend(loc="upper center", handlelength=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibrating.camera import CameraCalibration, calibrate_camera, compare_camera, ideal_pixels
 from semantic_mapper.drivers.calibrating.views import BoardView, CalibrationConfig, ViewGatherer, simultaneous
-from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
+from semantic_mapper.drivers.poses.board import board_poses
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -34,37 +34,30 @@ class RigCamera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigCalibration:
-    """A calibrated rig."""
-
-    cameras: dict[str, RigCamera]
-    rms_px: float  # of all corners at once
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """All that came out."""
+    """All that came out, by camera."""
 
-    cameras: dict[str, CameraCalibration]  # by name
-    rig: RigCalibration | None  # None where it was not requested
+    cameras: dict[str, CameraCalibration]
+    rig: dict[str, RigCamera] = field(default_factory=dict[str, RigCamera])  # empty where it was not requested
+    rig_rms_px: float = 0.0  # of all corners at once
 
 
 def solve(
     gathered: Mapping[str, ViewGatherer], known: Collection[str], config: CalibrationConfig, *, rig: bool
 ) -> Calibration:
-    """Calibrate cameras, the first one of which is where the rig is; ``rig``: also find where they sit on it.
+    """Calibrate cameras and, with ``rig``, find where they sit on it; the first one is where the rig is.
+
+    Raises CameraError: a result is not as ``config`` wants it; says why, and what to do.
 
     Args:
         gathered: By camera.
         known: Cameras whose intrinsics are right as their source gives them.
-        config: What a result has to be like; ``CameraError`` says why one is not, and what to do.
+        config: What a result has to be like.
         rig: See above.
     """
     cameras: dict[str, CameraCalibration] = {}
     for name, views in gathered.items():
-        if views.size is None or views.intrinsics is None:
-            raise CameraError(f"camera '{name}': gave no image")
-        if not views.seen:
+        if views.size is None or views.intrinsics is None or not views.seen:
             raise CameraError(
                 f"camera '{name}': the board was found in none of {views.images} images; are its columns, rows, "
                 "dictionary and pattern those of the settings (`calibrate --board FILE.png` draws the board that is "
@@ -75,18 +68,16 @@ def solve(
         else:
             cameras[name] = calibrate_camera(name, views.kept, views.size, config)
     if not rig:
-        return Calibration(cameras, None)
+        return Calibration(cameras)
     instants = simultaneous({name: views.steady for name, views in gathered.items()})
-    found = calibrate_rig({name: camera.intrinsics for name, camera in cameras.items()}, instants, config)
-    return Calibration(cameras, found)
+    lenses = {name: camera.intrinsics for name, camera in cameras.items()}
+    return Calibration(cameras, *calibrate_rig(lenses, instants, config))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
     """What one camera saw at one instant; pixels without distortion."""
 
-    camera: int
-    instant: int
     points: Float64
     pixels: Float64
     T_camera_board: Float64
@@ -94,102 +85,84 @@ class _Sight:
 
 def calibrate_rig(
     cameras: Mapping[str, CameraIntrinsics], instants: Sequence[Mapping[str, BoardView]], config: CalibrationConfig
-) -> RigCalibration:
+) -> tuple[dict[str, RigCamera], float]:
     """At least two cameras and all boards fitted at once (bundle adjustment with the intrinsics as they are).
 
-    ``instants`` as of ``views.simultaneous``. ``CameraError``: cameras that hardly see the board at once, or views
-    that do not fit each other.
+    ``instants`` as of ``views.simultaneous``. Returns the cameras by name, and the RMS error of all corners in pixels.
+    Raises CameraError: cameras hardly see the board at once, or views do not fit each other.
     """
-    names, lenses = list(cameras), list(cameras.values())
-    sights = _sights(names, lenses, instants)
-    guess = _first_guess(names, sights)
-    boards = {s.instant: guess[s.camera] @ s.T_camera_board for s in reversed(sights)}
-    poses, rms_px, sigmas = _adjust_bundle(lenses, sights, guess, boards)
+    sights: list[dict[str, _Sight]] = []
+    for views in instants:
+        found = {name: _sight(views[name], lens) for name, lens in cameras.items() if name in views}
+        own = {name: sight for name, sight in found.items() if sight is not None}
+        if len(own) > 1:
+            sights.append(own)
+    poses, rms_px, sigmas = _adjust_bundle(cameras, sights, _first_guess(list(cameras), sights))
     if rms_px > config.max_error_px:
         raise CameraError(
             f"the cameras do not agree on where the board is: corners are off by {rms_px:.2f} px (RMS; "
             f"{config.max_error_px:g} are allowed). Hold the board still, and check that stamps are of one clock and "
             "that no camera has moved on the rig"
         )
-    found: dict[str, RigCamera] = {}
-    for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
-        turn, position = (float(np.sqrt((part**2).mean())) for part in np.split(sigmas[number], 2))
+    rig: dict[str, RigCamera] = {}
+    for name, pose, sigma in zip(cameras, poses, sigmas, strict=True):
+        turn, position = (float(np.sqrt((part**2).mean())) for part in np.split(sigma, 2))
         if position > MAX_POSITION_SIGMA_M:
             raise CameraError(
                 f"camera '{name}': its place on the rig is known to {1000 * position:.1f} mm only (one sigma; "
                 f"{1000 * MAX_POSITION_SIGMA_M:g} are needed): show the board nearer to both cameras at once"
             )
-        moments = sum(sight.camera == number for sight in sights)
-        found[name] = RigCamera(pose, moments, position, float(np.degrees(turn)))
-    return RigCalibration(found, rms_px)
+        rig[name] = RigCamera(pose, sum(name in own for own in sights), position, float(np.degrees(turn)))
+    return rig, rms_px
 
 
-def _sights(
-    names: Sequence[str], lenses: Sequence[CameraIntrinsics], instants: Sequence[Mapping[str, BoardView]]
-) -> list[_Sight]:
-    found: list[_Sight] = []
-    for number, views in enumerate(instants):
-        own: list[_Sight] = []
-        for camera, (name, lens) in enumerate(zip(names, lenses, strict=True)):
-            if name in views:
-                pixels = ideal_pixels(views[name].pixels, lens)
-                poses = board_poses(views[name].points, pixels, lens)
-                if poses:
-                    own.append(_Sight(camera, number, views[name].points, pixels, pose_of_vector(poses[0][1])))
-        found += own if len(own) > 1 else []
-    return found
+def _sight(view: BoardView, lens: CameraIntrinsics) -> _Sight | None:
+    pixels = ideal_pixels(view.pixels, lens)
+    poses = board_poses(view.points, pixels, lens)
+    return _Sight(view.points, pixels, poses[0][1]) if poses else None
 
 
-def _first_guess(names: Sequence[str], sights: Sequence[_Sight]) -> list[Float64]:
+def _first_guess(names: Sequence[str], sights: Sequence[Mapping[str, _Sight]]) -> dict[str, Float64]:
     """T_rig_camera along the pairs of cameras that see the board together most often; ``CameraError`` without any."""
-    by_instant: dict[int, dict[int, _Sight]] = {}
-    for sight in sights:
-        by_instant.setdefault(sight.instant, {})[sight.camera] = sight
-    known: dict[int, Float64] = {0: np.eye(4)}
+    known: dict[str, Float64] = {names[0]: np.eye(4)}
     while len(known) < len(names):
         shared = {
-            (a, b): [(s[a], s[b]) for s in by_instant.values() if a in s and b in s]
+            (a, b): [own[a].T_camera_board @ invert_pose(own[b].T_camera_board) for own in sights if {a, b} <= set(own)]
             for a in known
-            for b in range(len(names))
+            for b in names
             if b not in known
         }
-        (a, b), pairs = max(shared.items(), key=lambda item: len(item[1]))
-        if len(pairs) < MIN_INSTANTS:
-            lost = ", ".join(f"'{name}'" for i, name in enumerate(names) if i not in known)
+        (a, b), motions = max(shared.items(), key=lambda item: len(item[1]))
+        if len(motions) < MIN_INSTANTS:
+            lost = ", ".join(f"'{name}'" for name in names if name not in known)
             raise CameraError(
-                f"camera {lost}: saw the board at only {len(pairs)} moments together with another camera of the rig; "
+                f"camera {lost}: saw the board at only {len(motions)} moments together with another camera of the rig; "
                 f"{MIN_INSTANTS} are needed: hold it where both see it, still, in several places"
             )
-        known[b] = known[a] @ _middle([p.T_camera_board @ invert_pose(q.T_camera_board) for p, q in pairs])
-    return [known[i] for i in range(len(names))]
-
-
-def _middle(poses: Sequence[Float64]) -> Float64:
-    """The pose that is nearest to all others: one that is off does not pull it."""
-    stack = np.array(poses)
-    apart = np.linalg.norm((stack[:, None] - stack[None])[..., :3, :], axis=(-2, -1)).sum(axis=1)
-    return stack[int(apart.argmin())]
+        # The one that is nearest to all others: one that is off does not pull it.
+        stack = np.array(motions)
+        apart = np.linalg.norm((stack[:, None] - stack[None])[..., :3, :], axis=(-2, -1)).sum(axis=1)
+        known[b] = known[a] @ stack[int(apart.argmin())]
+    return {name: known[name] for name in names}
 
 
 def _adjust_bundle(
-    lenses: Sequence[CameraIntrinsics],
-    sights: Sequence[_Sight],
-    cameras: Sequence[Float64],
-    boards: Mapping[int, Float64],
+    cameras: Mapping[str, CameraIntrinsics], sights: Sequence[Mapping[str, _Sight]], guess: Mapping[str, Float64]
 ) -> tuple[Float64, float, Float64]:
     """Fit the poses of all cameras but the first and of all boards to the corners seen, from a first guess.
 
     Returns: T_rig_camera by camera, the RMS error in pixels, and one sigma (C, 6) of turn (radians) and position.
     """
-    rows = {instant: len(cameras) + row for row, instant in enumerate(boards)}
-    start = np.array([*cameras, *boards.values()])  # (P, 4, 4)
-    counts = [len(sight.points) for sight in sights]
-    camera = np.repeat([sight.camera for sight in sights], counts)  # (N,)
-    board = np.repeat([rows[sight.instant] for sight in sights], counts)
-    points = np.concatenate([sight.points for sight in sights])
-    pixels = np.concatenate([sight.pixels for sight in sights])
-    focal = np.array([(lens.fx, lens.fy) for lens in lenses])[camera]
-    centre = np.array([(lens.cx, lens.cy) for lens in lenses])[camera]
+    numbers = {name: number for number, name in enumerate(cameras)}
+    first = [next(iter(own.items())) for own in sights]
+    boards = [guess[name] @ sight.T_camera_board for name, sight in first]
+    start = np.array([*guess.values(), *boards])  # (P, 4, 4)
+    seen = [(numbers[name], len(cameras) + row, s) for row, own in enumerate(sights) for name, s in own.items()]
+    owners = [(camera, board) for camera, board, sight in seen for _ in sight.points]
+    camera, board = np.array(owners).T  # (N,) rows of ``start``
+    points = np.concatenate([sight.points for *_, sight in seen])
+    pixels = np.concatenate([sight.pixels for *_, sight in seen])
+    focal, centre = np.array([((k.fx, k.fy), (k.cx, k.cy)) for k in cameras.values()])[camera].transpose(1, 0, 2)
 
     def poses(x: Float64) -> Float64:
         """(P, 4, 4); each but the first is moved by a rotation vector and a shift in its own axes."""
@@ -208,12 +181,10 @@ def _adjust_bundle(
     # A corner depends on one camera and one board: with the pattern known, few differences give all derivatives.
     touched = np.zeros((len(points), len(start)), np.uint8)
     touched[np.arange(len(points)), camera] = touched[np.arange(len(points)), board] = 1
-    sparsity = np.kron(touched[:, 1:], np.ones((2, 6), np.uint8))
-    guess = np.zeros(6 * (len(start) - 1))
     fit: Any = least_squares(
         residuals,
-        guess,
-        jac_sparsity=sparsity,
+        np.zeros(6 * (len(start) - 1)),
+        jac_sparsity=np.kron(touched[:, 1:], np.ones((2, 6), np.uint8)),
         tr_options={"atol": 1e-12, "btol": 1e-12},  # with steps less exact, one wrong view takes thousands of them
         loss="huber",
         f_scale=_HUBER_PX,
@@ -222,7 +193,7 @@ def _adjust_bundle(
     )
     squares = (residuals(fit.x) ** 2).sum()
     hessian = (fit.jac.T @ fit.jac).toarray()  # of the robust cost
-    covariance = squares / max(1, len(pixels) * 2 - len(guess)) * np.linalg.inv(hessian)
+    covariance = squares / max(1, pixels.size - len(fit.x)) * np.linalg.inv(hessian)
     free = np.sqrt(np.diag(covariance)).reshape(-1, 6)[: len(cameras) - 1]
     sigmas = np.concatenate((np.zeros((1, 6)), free))
     return poses(fit.x)[: len(cameras)], float(np.sqrt(squares / len(pixels))), sigmas

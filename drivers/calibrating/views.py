@@ -9,12 +9,11 @@ from typing import Annotated, Literal
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import Config, Positive
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibration import guess_intrinsics
-from semantic_mapper.drivers.poses.board import BoardFinder, board_poses, pose_of_vector
+from semantic_mapper.drivers.poses.board import BoardFinder, board_poses
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -66,8 +65,7 @@ class ViewGatherer:
         self._config = config
         self._stream = stream
         self._last: BoardView | None = None
-        self._signatures: list[Float64] = []
-        self._tilts: list[Float64] = []
+        self._signatures: list[Float64] = []  # of the views that are kept
         self.images = self.seen = 0
         self.kept: list[BoardView] = []
         self.steady: list[BoardView] = []
@@ -93,25 +91,19 @@ class ViewGatherer:
         if self._stream and not _stands_still(before, view):
             return False
         self.steady.append(view)
-        return self._keep(view, size)
-
-    def lacks(self) -> tuple[str, ...]:
-        """What the kept views lack for a calibration, as sentences; empty where they may do."""
-        if self.size is None:
-            return ("no image has come yet",)
-        tilts = np.array(self._tilts).reshape(-1, 2)
-        return shortfalls(self._config, len(self.kept), area_counts([v.pixels for v in self.kept], self.size), tilts)
-
-    def _keep(self, view: BoardView, size: tuple[int, int]) -> bool:
-        if len(self.kept) >= MAX_VIEWS:
+        found = _signature(view, size) if len(self.kept) < MAX_VIEWS else None
+        if found is None or any(np.linalg.norm(found - other) < NEW for other in self._signatures):
             return False
-        found = _signature(view, size)
-        if found is None or any(np.linalg.norm(found[0] - other) < NEW for other in self._signatures):
-            return False
-        self._signatures.append(found[0])
-        self._tilts.append(found[1])
+        self._signatures.append(found)
         self.kept.append(view)
         return True
+
+    def lacks(self) -> list[str]:
+        """What the kept views lack for a calibration, as sentences; empty where they may do."""
+        if self.size is None:
+            return ["no image has come yet"]
+        tilts = np.degrees(np.reshape(self._signatures, (-1, 5))[:, 3:])
+        return shortfalls(self._config, len(self.kept), area_counts(self.kept, self.size), tilts)
 
 
 def simultaneous(views: Mapping[str, Sequence[BoardView]]) -> list[dict[str, BoardView]]:
@@ -125,36 +117,30 @@ def simultaneous(views: Mapping[str, Sequence[BoardView]]) -> list[dict[str, Boa
             began_ns = stamp_ns
         groups[-1][name] = view
     shared = [group for group in groups if len(group) > 1]
-    if len(shared) <= MAX_VIEWS:
-        return shared
-    return [shared[int(i)] for i in np.linspace(0, len(shared) - 1, MAX_VIEWS).round()]
+    chosen = np.linspace(0, len(shared) - 1, min(len(shared), MAX_VIEWS)).round()
+    return [shared[int(i)] for i in chosen]
 
 
-def area_counts(pixels: Sequence[Float64], size: tuple[int, int]) -> NDArray[np.int64]:
+def area_counts(views: Sequence[BoardView], size: tuple[int, int]) -> Float64:
     """Corners in each cell of the image, (CELLS, CELLS)."""
-    counts = np.zeros((CELLS, CELLS), np.int64)
-    for corners in pixels:
-        cells = np.clip(((corners + 0.5) / size * CELLS).astype(int), 0, CELLS - 1)
-        np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
-    return counts
+    u, v = np.concatenate([np.zeros((0, 2)), *(view.pixels for view in views)]).T + 0.5
+    return np.histogram2d(v, u, CELLS, ((0, size[1]), (0, size[0])))[0]
 
 
-def missing_regions(counts: NDArray[np.int64]) -> tuple[str, ...]:
+def missing_regions(counts: Float64) -> list[str]:
     """Names of the ninths of the image in which the board was not seen, or hardly."""
     side = CELLS // _ACROSS
     seen = (counts > 0).reshape(_ACROSS, side, _ACROSS, side).sum(axis=(1, 3)).ravel()
-    return tuple(name for name, cells in zip(REGIONS, seen, strict=True) if cells < _SEEN_CELLS)
+    return [name for name, cells in zip(REGIONS, seen, strict=True) if cells < _SEEN_CELLS]
 
 
-def tilt_degrees(T_camera_board: Float64) -> Float64:
+def tilt_radians(T_camera_board: Float64) -> Float64:
     """How far the board leans, (2,): up or down, and to a side; (0, 0) where it is seen head on."""
     x, y, z = T_camera_board[:3, 2]
-    return np.degrees(np.array((np.arctan2(y, z), np.arctan2(x, z))))
+    return np.array((np.arctan2(y, z), np.arctan2(x, z)))
 
 
-def shortfalls(
-    config: CalibrationConfig, views: int, counts: NDArray[np.int64], tilts: Float64 | None
-) -> tuple[str, ...]:
+def shortfalls(config: CalibrationConfig, views: int, counts: Float64, tilts: Float64 | None) -> list[str]:
     """What ``views`` views lack for a calibration that can be believed, as sentences that say what to do.
 
     ``counts`` are those of ``area_counts``; ``tilts`` (N, 2) degrees, None where they are not known yet.
@@ -162,19 +148,18 @@ def shortfalls(
     lacks: list[str] = []
     if views < config.min_views:
         lacks.append(f"{views} views that differ from each other, {config.min_views} are needed: move the board about")
-    missing = missing_regions(counts)
-    if missing:
+    if missing := missing_regions(counts):
         lacks.append(f"the board was not seen in these parts of the image: {', '.join(missing)}; hold it there, too")
     if tilts is None:
-        return tuple(lacks)
-    steepest = np.abs(tilts).max(axis=0) if len(tilts) else np.zeros(2)
+        return lacks
+    steepest = np.abs(tilts).max(axis=0, initial=0)
     for name, most in zip(("up or down", "to the left or right"), steepest, strict=True):
         if most < MIN_TILT_DEG:
             lacks.append(
                 f"the board never leaned {name} by {MIN_TILT_DEG:g} degrees (at most {most:.0f}); without that "
                 "the focal length cannot be distinguished from the distance"
             )
-    return tuple(lacks)
+    return lacks
 
 
 def _on_a_line(pixels: Float64) -> bool:
@@ -186,22 +171,19 @@ def _stands_still(before: BoardView | None, view: BoardView) -> bool:
     """Whether the corners that both show are where they were."""
     if before is None:
         return False
-    shared = (view.points[:, None] == before.points[None]).all(axis=-1)
-    ours, theirs = np.nonzero(shared)
+    ours, theirs = np.nonzero((view.points[:, None] == before.points[None]).all(axis=-1))
     moves = np.linalg.norm(view.pixels[ours] - before.pixels[theirs], axis=1)
     return len(moves) > 0 and float(np.median(moves)) <= STEADY_PX
 
 
-def _signature(view: BoardView, size: tuple[int, int]) -> tuple[Float64, Float64] | None:
-    """What a view is like: where in the image, how large, how it leans (5,); and its tilt in degrees (2,).
+def _signature(view: BoardView, size: tuple[int, int]) -> Float64 | None:
+    """What a view is like (5,): where in the image (2), how large, and how it leans (2, radians).
 
-    The tilt comes of a guessed focal length; that is good enough to tell views apart.
+    How it leans comes of a guessed focal length; that is good enough to tell views apart.
     """
     found = board_poses(view.points, view.pixels, guess_intrinsics(*size))
     if not found:
         return None
-    tilt = tilt_degrees(pose_of_vector(found[0][1]))
-    middle = view.pixels.mean(axis=0) / size
     hull = cv2.convexHull(view.pixels.astype(np.float32))
-    large = float(np.sqrt(cv2.contourArea(hull) / (size[0] * size[1])))
-    return np.array((*middle, large, *np.deg2rad(tilt))), tilt
+    large = np.sqrt(cv2.contourArea(hull) / (size[0] * size[1]))
+    return np.array((*(view.pixels.mean(axis=0) / size), large, *tilt_radians(found[0][1])))

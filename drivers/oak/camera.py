@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.base import CameraImage, as_camera_error
 from semantic_mapper.drivers.live import SLICE_S, Device, LiveCamera, first_of
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.device import Sources, capture_ns, clock_offset_ns, connect_device, synced_queue, take
@@ -21,7 +22,7 @@ from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.drivers.oak.odometry import Odometry
 from semantic_mapper.errors import CameraError, FrameError, PoseError
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 QUEUE = 4  # images that wait where the reader is slow; the oldest gives way, which is a gap
 ODOMETRY_WAIT_S = 0.3  # how long an image waits for its pose; then it goes without
@@ -54,25 +55,18 @@ class OakDevice(Device):
         self._clock_ns = clock_offset_ns()
         self._intrinsics: CameraIntrinsics | None = None
         self._notes = list(sources.notes)
-        outputs = {"rgb": sources.rgb} if sources.depth is None else {"rgb": sources.rgb, "depth": sources.depth}
-        try:
-            self._odometry = None
+        self._odometry: Odometry | None = None
+        fix = "try a smaller `width`, `height` or `fps`, calibrate the device, or give a file by `calibration`"
+        kinds = (RuntimeError, IndexError, FrameError, PoseError)  # DepthAI's, and of intrinsics and extrinsics
+        with ExitStack() as undo, as_camera_error(f"{sources.name} cannot be used", fix, *kinds):
+            undo.callback(self.close)
+            self._groups = synced_queue(sources.pipeline, sources.outputs, 0.5 / config.fps, QUEUE)
             if sources.odometry is not None:
                 self._odometry = Odometry(sources.pipeline, sources.odometry, config.fps)
-            self._groups = synced_queue(sources.pipeline, outputs, 0.5 / config.fps, QUEUE)
             sources.pipeline.start()
-            if self._odometry is not None:
-                self._odometry.start()
             # Images that wait for their poses.
             self._waiting = deque([first_of(lambda: self._next(SLICE_S), stopping, sources.name)])
-        except (RuntimeError, PoseError) as error:  # DepthAI's, and of the extrinsics
-            self.close()
-            raise CameraError(
-                f"{sources.name} cannot be used: {error}; try a smaller `width`, `height` or `fps`"
-            ) from error
-        except CameraError:
-            self.close()
-            raise
+            undo.pop_all()
         cameras = {camera_id: self._waiting[0].intrinsics}
         self.info = StreamInfo(sources.name, cameras, frame_hz=config.fps, metadata={**sources.metadata})
 
@@ -124,7 +118,7 @@ class OakDevice(Device):
             raise CameraError(
                 f"{self._sources.name} has gone (unplugged, without power, or its firmware has crashed)"
             ) from error
-        rgb, depth = group["rgb"], None if self._sources.depth is None else group["depth"]
+        rgb, depth = group["rgb"], group["depth"] if "depth" in self._sources.outputs else None
         try:
             pixels = rgb_pixels(rgb)
             depth_m = None if depth is None else depth_metres(depth)
@@ -132,9 +126,8 @@ class OakDevice(Device):
             return None
         lens = self._intrinsics
         if lens is None:
-            config = self._config
-            lens = reported_intrinsics(rgb)
-            lens = lens or read_intrinsics(self._sources.calibration, config.rgb, config.width, config.height)
+            size = self._config.width, self._config.height
+            lens = reported_intrinsics(rgb) or read_intrinsics(self._sources.calibration, self._config.rgb, *size)
             self._intrinsics = lens
             self._notes += geometry_troubles(rgb, depth)
         for image in (pixels, depth_m):
@@ -150,38 +143,26 @@ class OakDevice(Device):
 def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> CameraIntrinsics:
     """Intrinsics of an undistorted image, from a ``dai.CalibrationHandler``; what does not fit the ratio is cropped.
 
-    ``CameraError``: the calibration knows no such camera, or does not fit the image.
+    Raises RuntimeError, FrameError: the calibration knows no such camera, or does not fit the image.
     """
-    dai = load_depthai()
-    try:
-        K = np.array(calibration.getCameraIntrinsics(getattr(dai.CameraBoardSocket, socket), width, height))
-    except (RuntimeError, IndexError) as error:
-        raise CameraError(
-            f"the OAK's calibration says nothing of the camera at {socket}: {error}; calibrate the device, name "
-            "another socket, or give a file by `calibration`"
-        ) from error
-    return _pinhole(K, width, height)
+    board_socket = getattr(load_depthai().CameraBoardSocket, socket)
+    return _pinhole(calibration.getCameraIntrinsics(board_socket, width, height), width, height)
 
 
 def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
     """Intrinsics that a message carries: the calibration's, after every crop and scaling that the device has made.
 
-    None where it carries none; ``CameraError`` where they do not fit the image.
+    None where it carries none; ``FrameError`` where they do not fit the image.
     """
     transformation = frame.getTransformation()
     K = np.array(transformation.getIntrinsicMatrix(), np.float64)
-    if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not np.isfinite(K).all():
-        return None
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
+    if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not (np.diag(K) > 0).all():
         return None
     return _pinhole(K, *transformation.getSize())
 
 
-def _pinhole(K: Float64, width: int, height: int) -> CameraIntrinsics:
-    try:
-        return CameraIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
-    except FrameError as error:
-        raise CameraError(f"the OAK's calibration cannot be used: {error}; calibrate the device") from error
+def _pinhole(K: Any, width: int, height: int) -> CameraIntrinsics:
+    return CameraIntrinsics(float(K[0][0]), float(K[1][1]), float(K[0][2]), float(K[1][2]), width, height)
 
 
 def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:

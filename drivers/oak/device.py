@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.devices import find_device, load_depthai
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 
-SEARCH_S = 2.0  # how long the device is looked for before it counts as missing
 IMU_HZ = 200
 IMU_BATCH = 10  # reports that may wait on the device; each is sent as soon as it is there
 _SLOW_USB = ("LOW", "FULL", "HIGH")
@@ -32,12 +32,8 @@ _CLOCK_READINGS = 5
 class OdometryPorts:
     """Where odometry takes its images and gives its poses."""
 
-    # left_out, right_out: ``dai.Node.Output`` of the stereo pair.
-    left_out: Any
-    right_out: Any
-    # left_in, right_in: ``dai.Node.Input`` of the odometry node.
-    left_in: Any
-    right_in: Any
+    pair: Mapping[str, Any]  # "left" and "right": ``dai.Node.Output`` of the stereo pair
+    inputs: Mapping[str, Any]  # "left" and "right": ``dai.Node.Input`` of the odometry node
     pose_out: Any  # ``dai.Node.Output`` of its poses (``dai.TransformData``), in the order of the images
     T_left_rgb: Float64  # (4, 4) from the colour camera to the left one, metres
 
@@ -48,9 +44,7 @@ class Sources:
 
     pipeline: Any  # ``dai.Pipeline`` that holds the source nodes; not started yet
     device: Any | None  # ``dai.Device`` to close at the end; None on the host alone
-    # rgb, depth: ``dai.Node.Output`` of the colour images and of their depth; None without depth.
-    rgb: Any
-    depth: Any | None
+    outputs: Mapping[str, Any]  # ``dai.Node.Output`` of colour ("rgb") and, where there is depth, of "depth"
     calibration: Any  # ``dai.CalibrationHandler`` of the device
     name: str  # what people call it; ``address``: by which it is found again
     address: str
@@ -71,21 +65,14 @@ class Sources:
 
 def connect_device(config: Config) -> Sources:
     """Open the device and build its part of the pipeline; ``CameraError``: without one, or where it cannot do that."""
-    dai = load_depthai()
-    info = find_device(config.device, SEARCH_S)
+    info = find_device(config.device)
     name = f"the OAK {info.getDeviceId()} ({info.name})"
-    try:
-        device = dai.Device(info)
-    except RuntimeError as error:
-        raise CameraError(
-            f"{name} cannot be opened: {error}; plug it in again, or try another cable or port"
-        ) from error
-    with ExitStack() as undo:
+    with as_camera_error(f"{name} cannot be opened", "plug it in again, or try another cable or port", RuntimeError):
+        device = load_depthai().Device(info)
+    fix = "check the settings of the camera, and the calibration that is stored on it"
+    with ExitStack() as undo, as_camera_error(f"{name} does not take this configuration", fix, RuntimeError):
         undo.callback(device.close)
-        try:
-            sources = _sources(device, config)
-        except RuntimeError as error:
-            raise CameraError(f"{name} does not take this configuration: {error}") from error
+        sources = _sources(device, config)
         undo.pop_all()
     return sources
 
@@ -94,27 +81,20 @@ def load_calibration(device: Any, path: str) -> Any:
     """The ``dai.CalibrationHandler`` of a file (``CameraError``: it is another file), or of the device without one."""
     if not path:
         return device.readCalibration()
-    try:
+    with as_camera_error(path, "give a calibration as DepthAI writes it (JSON)", RuntimeError, ValueError):
         return load_depthai().CalibrationHandler(Path(path))
-    except (RuntimeError, ValueError) as error:
-        raise CameraError(f"{path}: not a calibration of DepthAI's: {error}") from error
 
 
 def rgb_to_left(calibration: Any, config: Config) -> Float64:
-    """``T_left_rgb`` (4, 4) in metres, of a ``dai.CalibrationHandler``; ``CameraError`` where it links them not."""
+    """``T_left_rgb`` (4, 4) in metres, of a ``dai.CalibrationHandler``; DepthAI's error where it does not link them."""
     dai = load_depthai()
     rgb, left = (getattr(dai.CameraBoardSocket, socket) for socket in (config.rgb, config.left))
     if rgb == left:
         return np.eye(4)
-    try:
-        matrix = calibration.getCameraExtrinsics(rgb, left, False, dai.LengthUnit.METER)
-    except RuntimeError as error:
-        raise CameraError(f"the OAK's calibration does not link {config.rgb} and {config.left}: {error}") from error
-    return np.array(matrix, np.float64)
+    return np.array(calibration.getCameraExtrinsics(rgb, left, False, dai.LengthUnit.METER), np.float64)
 
 
 def _sources(device: Any, config: Config) -> Sources:
-    """Raises RuntimeError, too: DepthAI's."""
     dai = load_depthai()
     device.setMaxReconnectionAttempts(0)  # the camera does that itself, and can be stopped
     _check_abilities(device, config)
@@ -128,13 +108,13 @@ def _sources(device: Any, config: Config) -> Sources:
     rgb = _camera(pipeline, config.rgb, config).requestOutput(
         (config.width, config.height), dai.ImgFrame.Type.NV12, fps=config.fps, enableUndistortion=True
     )
-    depth, odometry = None, None
+    outputs, odometry = {"rgb": rgb}, None
     if config.depth:
         left, right = (
             _camera(pipeline, socket, config).requestOutput((config.stereo_width, config.stereo_height), fps=config.fps)
             for socket in (config.left, config.right)
         )
-        depth = _aligned_depth(pipeline, device, left, right, rgb, config)
+        outputs["depth"] = _aligned_depth(pipeline, device, left, right, rgb, config)
         if config.odometry:
             odometry = _odometry(pipeline, left, right, rgb_to_left(calibration, config))
     usb, notes = device.getUsbSpeed().name, ()
@@ -144,8 +124,7 @@ def _sources(device: Any, config: Config) -> Sources:
     return Sources(
         pipeline=pipeline,
         device=device,
-        rgb=rgb,
-        depth=depth,
+        outputs=outputs,
         calibration=calibration,
         name=f"{product} {device.getDeviceId()}",
         address=config.device or device.getDeviceId(),
@@ -206,7 +185,8 @@ def _odometry(pipeline: Any, left: Any, right: Any, T_left_rgb: Float64) -> Odom
     basalt.runSyncOnHost(True)  # its images come from the host, see ``odometry.py``
     basalt.setImuUpdateRate(IMU_HZ)
     imu.out.link(basalt.imu)
-    return OdometryPorts(left, right, basalt.left, basalt.right, basalt.transform, T_left_rgb)
+    inputs = {"left": basalt.left, "right": basalt.right}
+    return OdometryPorts({"left": left, "right": right}, inputs, basalt.transform, T_left_rgb)
 
 
 def synced_queue(pipeline: Any, outputs: Mapping[str, Any], within_s: float, size: int) -> Any:

@@ -5,25 +5,24 @@ from __future__ import annotations
 import functools
 import importlib
 import os
-import re
-import time
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
+from semantic_mapper.drivers import registry
+from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.registry import FoundCamera
-from semantic_mapper.errors import CameraError, DependencyError
+from semantic_mapper.errors import DependencyError
 
-USB_VENDOR = "03e7"
-SYSFS_USB = Path("/sys/bus/usb/devices")
-USB_NODES = Path("/dev/bus/usb")
 UDEV_RULE = (
     """echo 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"' | sudo tee /etc/udev/rules.d/80-movidius.rules """
     "&& sudo udevadm control --reload-rules && sudo udevadm trigger"
 )
 _BUSY = ("X_LINK_BOOTED", "X_LINK_GATE_BOOTED")
-_IP = re.compile(r"\d{1,3}(\.\d{1,3}){3}\Z")
-_SEARCH_STEP_S = 0.2
+_FIX = (
+    "end the program that uses it, or plug it in again, with its own cable, into a USB 3 port. PoE: check that its "
+    "switch port gives power, that this machine has an address in its network, and that no firewall stops UDP and TCP ports "
+    "11490 and 11491; `device` may be its IP address, which also works through a router. `semantic-mapper doctor "
+    f"--cameras` shows those that answer. Without permission on USB it does not show either: {UDEV_RULE}"
+)
 
 
 @functools.cache
@@ -49,61 +48,25 @@ def list_devices() -> list[FoundCamera]:
     return sorted((_describe(info) for info in _search()), key=lambda device: (device.name, device.address))
 
 
-def find_device(address: str, search_s: float) -> Any:
-    """DepthAI's ``DeviceInfo`` of one device, which is looked for until it is there.
+def find_device(address: str) -> Any:
+    """DepthAI's ``DeviceInfo`` by id, IP address or USB path; empty for the only one that is connected and free.
 
-    Args:
-        address: Id, IP address or USB path; empty for the only one that is connected.
-        search_s: How long to look; then ``CameraError`` says how to fix it.
+    Raises CameraError: there is none, or several.
     """
-    deadline = time.monotonic() + search_s
-    while True:
-        found = _search(address)
-        names = ", ".join(f"{d.getDeviceId()} ({d.name})" for d in found)
-        if len(found) > 1:
-            raise CameraError(f"several OAK cameras are connected: {names}; say which one by `device`")
-        if found and found[0].state.name not in _BUSY:
-            return found[0]
-        if time.monotonic() > deadline:
-            busy = f"the OAK {names} is in use by another process: end that one, or name another device"
-            raise CameraError(busy if found else missing(address))
-        time.sleep(_SEARCH_STEP_S)
 
+    def free() -> dict[str, Any]:
+        return {f"{d.getDeviceId()} ({d.name})": d for d in _search(address) if d.state.name not in _BUSY}
 
-def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> str:
-    """Why no OAK (of this address; empty = any) can be found, as far as this machine knows, and how to fix it."""
-    if _IP.match(address):
-        return (
-            f"no OAK answers at {address}: check that it has power (its switch port or injector must give PoE), that "
-            f"this machine has an address in its network (`ping {address}`), and that no firewall stops UDP and TCP "
-            "ports 11490 and 11491"
-        )
-    what = f"the OAK '{address}' is not connected" if address else "no OAK camera is connected"
-    boards: list[str] = []
-    for vendor in sorted(sysfs.glob("*/idVendor")):
-        with suppress(OSError, ValueError):  # it has been unplugged meanwhile
-            if vendor.read_text().strip() == USB_VENDOR:
-                bus, device = (int((vendor.parent / name).read_text()) for name in ("busnum", "devnum"))
-                node = nodes / f"{bus:03d}" / f"{device:03d}"
-                boards.append(f"{node}" if os.access(node, os.W_OK) else f"{node}, which this user may not open")
-    there = f", though there is one on USB ({'; '.join(boards)})" if boards else ""
-    return (
-        f"{what}{there}: plug it in again, with its own cable, into a USB 3 port (PoE: `device` may be its IP address, "
-        "which also works through a router); `semantic-mapper doctor --cameras` shows those that answer. Without "
-        f"permission it does not show either: {UDEV_RULE}"
-    )
+    return registry.find_device(free, "OAK", address, _FIX)
 
 
 def _search(address: str = "") -> list[Any]:
-    """Raises CameraError: DepthAI cannot search."""
     dai = load_depthai()
-    try:
+    with as_camera_error("DepthAI cannot search for cameras", "is the USB bus in order?", RuntimeError):
         if not address:
             return list(dai.Device.getAllConnectedDevices())
         found, info = dai.Device.getDeviceByIdOrName(address)
-    except RuntimeError as error:
-        raise CameraError(f"DepthAI cannot search for cameras: {error}") from error
-    return [info] if found else []
+        return [info] if found else []
 
 
 def _describe(info: Any) -> FoundCamera:

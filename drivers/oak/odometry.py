@@ -39,15 +39,8 @@ def basalt_pose(position: tuple[float, float, float], quaternion: tuple[float, f
 
 
 class Odometry:
-    """The poses of one connection; its thread runs from ``start`` to ``close``.
-
-    Args:
-        pipeline: ``dai.Pipeline``, not started yet.
-        ports: Of the odometry node.
-        fps: Rate of the pairs.
-
-    ``trouble`` says what does not work now. ``PoseError``: the extrinsics are no rigid transform.
-    """
+    """The poses of one connection; ``trouble`` says what does not work now. Its thread runs to ``close``, which comes
+    once the pipeline has ended. ``PoseError``: the extrinsics are no rigid transform."""
 
     def __init__(self, pipeline: Any, ports: OdometryPorts, fps: float) -> None:
         check_pose(ports.T_left_rgb, "extrinsics of the OAK's colour camera")
@@ -56,13 +49,14 @@ class Odometry:
         self._world = time.monotonic_ns()
         self._track = PoseTrack(KEPT, GAP_NS, max_ahead_ns=0)
         self._lock = threading.Lock()  # of the track
-        self._pairs = synced_queue(pipeline, {"left": ports.left_out, "right": ports.right_out}, 0.5 / fps, size=1)
-        self._inputs = {"left": ports.left_in.createInputQueue(), "right": ports.right_in.createInputQueue()}
+        self._pairs = synced_queue(pipeline, ports.pair, 0.5 / fps, size=1)
+        self._inputs = {side: port.createInputQueue() for side, port in ports.inputs.items()}
         self._poses = ports.pose_out.createOutputQueue(maxSize=16, blocking=False)
         self._clock_ns = clock_offset_ns()
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="oak-odometry", daemon=True)
         self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="oak-odometry", daemon=True)
+        self._thread.start()
 
     def reaches(self, stamp_ns: int) -> bool:
         """Whether the poses go as far as this moment: waiting longer brings nothing new for it."""
@@ -77,15 +71,10 @@ class Odometry:
             return None
         return PoseEstimate(found.T @ self._T_left_rgb, "vio", world=self._world)
 
-    def start(self) -> None:
-        """Begin, once the pipeline runs."""
-        self._thread.start()
-
     def close(self) -> None:
         """End, once the pipeline has ended."""
         self._closed.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.join()
 
     def check(self) -> None:
         """Raise what ended the thread, if anything did, as a ``CameraError``."""

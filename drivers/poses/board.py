@@ -12,7 +12,7 @@ from PIL import Image
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import BoardPoses, matrix
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose
+from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose, rotation_vector
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 PIXELS_A_METRE = 11811  # of the board to be printed: 300 dots an inch, about
@@ -126,7 +126,7 @@ class BoardPoseSource(PoseSource):
         solutions = board_poses(points, pixels, image.intrinsics)
         if not solutions:
             return self._refuse("no_board", "its corners allow no pose")
-        (error_px, pose), others = solutions[0], solutions[1:]
+        (error_px, T_camera_board), others = solutions[0], solutions[1:]
         if error_px > MAX_ERROR_PX:
             return self._refuse(
                 "inexact", f"its corners are off by {error_px:.1f} px; check its sizes and the camera's"
@@ -134,11 +134,11 @@ class BoardPoseSource(PoseSource):
         corner_px = max(error_px, MIN_CORNER_SIGMA_PX)
         if others and others[0][0] < MIN_FLIP_RATIO * corner_px:
             return self._refuse("ambiguous", "its mirrored pose fits as well; show it larger, or from the side")
-        sigma = _position_sigma(points, pose, image.intrinsics, corner_px)
+        sigma = _position_sigma(points, T_camera_board, image.intrinsics, corner_px)
         if sigma > MAX_SIGMA_M:
             return self._refuse("uncertain", f"it gives the camera's place to {sigma:.2f} m only; show it larger")
         self._warnings = ()
-        return PoseEstimate(self._T_world_board @ invert_pose(pose_of_vector(pose)), "board", sigma)
+        return PoseEstimate(self._T_world_board @ invert_pose(T_camera_board), "board", sigma)
 
     def _refuse(self, reason: str, detail: str) -> None:
         self._counters[reason] += 1
@@ -146,40 +146,31 @@ class BoardPoseSource(PoseSource):
 
 
 def board_poses(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> list[tuple[float, Float64]]:
-    """Poses (6,) of the board as rotation vector and position, each with its RMS error in pixels; the best one first.
+    """T_camera_board (4, 4) of corners (N, 3) seen at pixels (N, 2), each with its RMS error in pixels, the best first.
 
     A flat board has two: the true one, and one that leans the other way.
     """
     K = camera_matrix(intrinsics)
-    count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
+    _, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
     found: list[tuple[float, Float64]] = []
-    for number in range(count):
-        turn, shift = cv2.solvePnPRefineLM(points, pixels, K, None, turns[number], shifts[number])
-        pose = np.concatenate((np.ravel(turn), np.ravel(shift))).astype(np.float64)
-        seen, _ = cv2.projectPoints(points, pose[:3], pose[3:], K, None)
+    for first_turn, first_shift in zip(turns, shifts, strict=True):
+        turn, shift = cv2.solvePnPRefineLM(points, pixels, K, None, first_turn, first_shift)
+        seen, _ = cv2.projectPoints(points, turn, shift, K, None)
         error_px = float(np.sqrt(((seen[:, 0] - pixels) ** 2).sum(axis=1).mean()))
-        if pose[5] > 0 and np.isfinite(error_px):  # in front of the camera
-            found.append((error_px, pose))
+        if shift[2] > 0 and np.isfinite(error_px):  # in front of the camera
+            found.append((error_px, make_pose(np.ravel(turn), np.ravel(shift))))
     found.sort(key=lambda solution: solution[0])
     distinct = [p for p in found[1:] if np.linalg.norm(p[1] - found[0][1]) > 1e-3]  # refined onto the same one
     return found[:1] + distinct
 
 
-def pose_of_vector(pose: Float64) -> Float64:
-    """(4, 4) of a rotation vector and a position (6,)."""
-    return make_pose(pose[:3], pose[3:])
-
-
-def _position_sigma(points: Float64, pose: Float64, intrinsics: CameraIntrinsics, corner_px: float) -> float:
+def _position_sigma(points: Float64, T_camera_board: Float64, intrinsics: CameraIntrinsics, corner_px: float) -> float:
     """One-sigma uncertainty of the camera's position in metres, to first order, from that of the corners."""
-    _, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], camera_matrix(intrinsics), None)
+    turn, shift = rotation_vector(T_camera_board), T_camera_board[:3, 3]
+    _, jacobian = cv2.projectPoints(points, turn, shift, camera_matrix(intrinsics), None)
     by_pose = np.asarray(jacobian, np.float64)[:, :6]  # (2N, 6)
     covariance = corner_px**2 * np.linalg.pinv(by_pose.T @ by_pose)
-    step = 1e-6
-
-    def position(pose: Float64) -> Float64:
-        return invert_pose(pose_of_vector(pose))[:3, 3]
-
-    columns = [(position(pose + d) - position(pose - d)) / (2 * step) for d in step * np.eye(6)]
-    by_position = np.stack(columns, axis=1)  # (3, 6)
+    R, R_by_turn = cv2.Rodrigues(turn)
+    by_turn = R_by_turn.reshape(3, 3, 3).transpose(0, 2, 1) @ shift
+    by_position = np.hstack((by_turn.T, R.T))  # (3, 6), of the position -R.T @ shift, up to its sign
     return float(np.sqrt(np.trace(by_position @ covariance @ by_position.T) / 3))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
 
-from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.base import CameraImage, as_camera_error
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.drivers.live import SLICE_S, Device, LiveCamera, StreamClock, first_of
 from semantic_mapper.drivers.realsense.config import Config
@@ -19,7 +19,6 @@ from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64
 
-SEARCH_S = 2.0  # how long the device is looked for before it counts as missing
 QUEUE = 4  # synced sets that wait; the oldest gives way
 _SHOWN = 12  # modes that an error names
 GRID = 12  # points a side that the lens model is fitted to
@@ -27,13 +26,13 @@ MISFIT_PX = 0.5  # so far OpenCV's model of the lens may be off the SDK's
 _SLOW_USB = ("1.", "2.")
 
 
-def open_camera(config: Config, camera_id: str, find: Callable[[str, float], Any] = find_device) -> LiveCamera:
+def open_camera(config: Config, camera_id: str, find: Callable[[str], Any] = find_device) -> LiveCamera:
     """The camera of a config, opened when it is entered. ``find`` gives the SDK's device by serial number."""
     serial = config.device
 
     def open_device(stopping: threading.Event) -> RealSenseDevice:
         nonlocal serial
-        found = find(serial, SEARCH_S)
+        found = find(serial)
         serial = about(found, "serial_number")  # the next connection is to the same one
         return RealSenseDevice(found, config, camera_id, stopping)
 
@@ -56,17 +55,12 @@ class RealSenseDevice(Device):
         self._align = rs.align(rs.stream.color)
         self._clock = StreamClock()
         self._rectify: Rectifier | None = None
-        try:
+        fix = "end the program that uses it, plug it in again, or calibrate it"
+        with ExitStack() as undo, as_camera_error(f"{self._name}: cannot be opened", fix, RuntimeError, FrameError):
+            undo.callback(self.close)
             self._open_sensors()
             self._first: CameraImage | None = first_of(self._next, stopping, self._name)
-        except RuntimeError as error:
-            self.close()
-            raise CameraError(
-                f"{self._name}: cannot be opened: {error}; end the program that uses it, or plug it in again"
-            ) from error
-        except CameraError:
-            self.close()
-            raise
+            undo.pop_all()
         metadata = {"driver": "realsense", "device": serial}
         cameras = {camera_id: self._first.intrinsics}
         self.info = StreamInfo(self._name, cameras, frame_hz=float(config.fps), metadata=metadata)
@@ -79,10 +73,8 @@ class RealSenseDevice(Device):
     def read(self) -> CameraImage | None:
         """As of ``Device``."""
         first, self._first = self._first, None
-        try:
+        with as_camera_error(f"{self._name} fails", "plug it in again", RuntimeError):
             return first or self._next()
-        except RuntimeError as error:  # the SDK's
-            raise CameraError(f"{self._name} fails: {error}") from error
 
     def close(self) -> None:
         """As of ``Device``."""
@@ -168,16 +160,12 @@ class RealSenseDevice(Device):
 
 def read_intrinsics(reported: Any) -> CameraIntrinsics:
     """Of the SDK's ``intrinsics``, with OpenCV's coefficients for whatever lens model it has, fitted by its own rays,
-    since one of them is the inverse of OpenCV's. ``CameraError``: impossible ones, or no five coefficients fit."""
+    since one of them is the inverse of OpenCV's. ``FrameError``: impossible ones; ``CameraError``: none fit."""
     lens: tuple[float, ...] = ()
     if any(reported.coeffs) and reported.model != load_realsense().distortion.none:
         lens = _fit_lens(reported)
-    try:
-        return CameraIntrinsics(
-            reported.fx, reported.fy, reported.ppx, reported.ppy, reported.width, reported.height, lens
-        )
-    except FrameError as error:
-        raise CameraError(f"the RealSense's calibration cannot be used: {error}; calibrate the device") from error
+    k = (reported.fx, reported.fy, reported.ppx, reported.ppy)
+    return CameraIntrinsics(*k, reported.width, reported.height, lens)
 
 
 def _fit_lens(reported: Any) -> tuple[float, ...]:

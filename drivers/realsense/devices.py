@@ -5,17 +5,16 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
+from semantic_mapper.drivers import registry
+from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.registry import FoundCamera
-from semantic_mapper.errors import CameraError, DependencyError
+from semantic_mapper.errors import DependencyError
 from semantic_mapper.mapping.open3d_loader import preload_folder, preload_libusb
 
-USB_VENDOR = "8086"
-UDEV_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{USB_VENDOR}", MODE="0666"'
-_SEARCH_STEP_S = 0.2
+UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="8086", MODE="0666"'
 _FIX = (
     "check its cable (a USB 3 port, `lsusb` shows it as Intel or RealSense); without permission it does not show "
     f"either: echo '{UDEV_RULE}' | sudo tee /etc/udev/rules.d/99-realsense.rules && sudo udevadm control "
@@ -48,32 +47,22 @@ def list_devices() -> list[FoundCamera]:
     return found
 
 
-def find_device(serial: str, search_s: float) -> Any:
-    """The SDK's ``device`` of a serial number, looked for until it is there; empty for the only one that is connected.
+def find_device(serial: str) -> Any:
+    """The SDK's ``device`` of a serial number; empty for the only one that is connected.
 
-    Raises CameraError: there is no device, or several where one should be; and how to fix it.
+    Raises CameraError: there is none, or several.
     """
-    deadline = time.monotonic() + search_s
-    while True:
-        devices = {about(device, "serial_number"): device for device in connected()}
-        fitting = [device for number, device in devices.items() if serial in ("", number)]
-        if len(fitting) == 1:
-            return fitting[0]
-        if len(fitting) > 1:
-            raise CameraError(f"several RealSense cameras are connected: {', '.join(devices)}; say which by `device`")
-        if time.monotonic() > deadline:
-            what = f"the RealSense '{serial}' is not connected" if serial else "no RealSense camera is connected"
-            there = f" (there is {', '.join(devices)})" if devices else ""
-            raise CameraError(f"{what}{there}: {_FIX}")
-        time.sleep(_SEARCH_STEP_S)
+
+    def fitting() -> dict[str, Any]:
+        return {number: d for d in connected() if serial in ("", number := about(d, "serial_number"))}
+
+    return registry.find_device(fitting, "RealSense", serial, _FIX)
 
 
 def connected() -> list[Any]:
     """The SDK's ``device`` of each camera; ``CameraError`` where it cannot search."""
-    try:
+    with as_camera_error("the RealSense SDK cannot search for cameras", "is the USB bus in order?", RuntimeError):
         return list(load_realsense().context().query_devices())
-    except RuntimeError as error:
-        raise CameraError(f"the RealSense SDK cannot search for cameras: {error}") from error
 
 
 def about(device: Any, what: str) -> str:

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.table import Table
 
@@ -19,10 +18,11 @@ from semantic_mapper.drivers.calibrating.rig import Calibration
 from semantic_mapper.drivers.calibrating.views import CELLS, CalibrationConfig, ViewGatherer, missing_regions
 from semantic_mapper.drivers.calibration import StereoCalibration, save_calibration, save_stereo
 from semantic_mapper.drivers.poses.config import BoardPoses
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.nodes.calibration.sources import SIDES
+from semantic_mapper.plots import write_picture
+
+_WORST = 3  # views named in the tables
 
 
 class CalibrationSettings(Config, frozen=True):
@@ -37,16 +37,15 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
     written: list[Path] = []
     for name, camera in found.cameras.items():
         about = _about(settings) | {"views": len(camera.views), "rms_px": round(camera.rms_px, 4)}
-        about |= {f"sigma_{key}": float(f"{sigma:.3g}") for key, sigma in camera.sigmas.items()}
-        mount = None
-        if found.rig is not None:
-            place = found.rig.cameras[name]
-            mount = place.T_rig_camera
+        about |= {f"sigma_{key}": _rounded(sigma) for key, sigma in camera.sigmas.items()}
+        place = found.rig.get(name)
+        if place is not None:
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
-            about["rig_position_sigma_mm"] = float(f"{1000 * place.position_sigma_m:.3g}")
-            about["rig_turn_sigma_deg"] = float(f"{place.turn_sigma_deg:.3g}")
-        save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
-        written += [out / f"{name}.toml", _write_picture(out / f"{name}.png", name, camera)]
+            about["rig_position_sigma_mm"] = _rounded(1000 * place.position_sigma_m)
+            about["rig_turn_sigma_deg"] = _rounded(place.turn_sigma_deg)
+        file = out / f"{name}.toml"
+        save_calibration(file, camera.intrinsics, None if place is None else place.T_rig_camera, about)
+        written += [file, _draw(out, name, name, camera)]
     return written
 
 
@@ -56,9 +55,8 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
     Cameras are named by the half of the image; their rig tells whose half is which. ``ConfigError``: a file cannot be
     written; it is as it was.
     """
-    assert found.rig is not None
     left, right = (found.cameras[side] for side in SIDES)
-    place = found.rig.cameras[SIDES[1]]
+    place = found.rig[SIDES[1]]
     T_right_left = invert_pose(place.T_rig_camera)
     swapped = bool(T_right_left[0, 3] > 0)
     if swapped:
@@ -66,14 +64,18 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
     about = _about(settings) | {
         "views": min(len(left.views), len(right.views)),
         "moments": place.moments,
-        "rms_px": round(found.rig.rms_px, 4),
+        "rms_px": round(found.rig_rms_px, 4),
         "baseline_mm": round(1000 * float(np.linalg.norm(T_right_left[:3, 3])), 3),
-        "sigma_baseline_mm": float(f"{1000 * place.position_sigma_m:.3g}"),
+        "sigma_baseline_mm": _rounded(1000 * place.position_sigma_m),
     }
     file = out / f"{name}.toml"
     save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
     sides = zip(SIDES, (left, right), strict=True)
-    return [file, *(_write_picture(out / f"{name}-{side}.png", f"{name} {side}", camera) for side, camera in sides)]
+    return [file, *(_draw(out, f"{name}-{side}", f"{name} {side}", camera) for side, camera in sides)]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")
 
 
 def _about(settings: CalibrationSettings) -> dict[str, str | float]:
@@ -85,78 +87,66 @@ def _about(settings: CalibrationSettings) -> dict[str, str | float]:
     }
 
 
-def _write_picture(path: Path, name: str, camera: CameraCalibration) -> Path:
-    drawn = draw_calibration(name, camera)
-    data = cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes()
-    write_bytes(path, data, raises=ConfigError)
-    return path
-
-
-def tables(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:
-    """Tables for people; so many of the worst views are named."""
-    for name, camera in found.cameras.items():
-        yield _camera_table(name, camera, gathered[name], worst)
-    if found.rig is not None:
-        caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
-        titles = ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg")
-        table = Table(*titles, title="rig", title_justify="left", caption=caption)
-        for name, place in found.rig.cameras.items():
-            turned = np.degrees(np.linalg.norm(rotation_vector(place.T_rig_camera)))
-            position = ", ".join(f"{1000 * v:.1f}" for v in place.T_rig_camera[:3, 3])
-            sigmas = f"{1000 * place.position_sigma_m:.2f}", f"{place.turn_sigma_deg:.3f}"
-            table.add_row(name, str(place.moments), position, sigmas[0], f"{turned:.2f}", sigmas[1])
-        yield table
-
-
-def _values(camera: CameraCalibration) -> dict[str, float]:
-    i = camera.intrinsics
-    values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
-    return values | dict(zip(COEFFICIENT_NAMES, i.distortion, strict=False))
-
-
-def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, worst: int) -> Table:
-    i = camera.intrinsics
-    table = Table(title=f"{name}, {i.width} x {i.height}", title_justify="left", show_header=False)
-    table.add_column()
-    table.add_column(overflow="fold")
-    left_out = f"; {len(camera.left_out)} did not fit: {', '.join(camera.left_out)}" if camera.left_out else ""
-    table.add_row(
-        "images", f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
-    )
-    table.add_row("error", f"{camera.rms_px:.3f} px RMS")
-    order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
-    table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
-    if not camera.estimated:
-        table.add_row("intrinsics", "as the source gives them")
-    for key, value in _values(camera).items():
-        sigma = f" +- {camera.sigmas[key]:.2g}" if key in camera.sigmas else ""
-        table.add_row(key, f"{value:.2f}{sigma}" if key in ("fx", "fy", "cx", "cy") else f"{value:.5f}{sigma}")
-    missing = ", ".join(missing_regions(camera.counts))
-    seen = f"{np.count_nonzero(camera.counts)} of {CELLS * CELLS} cells" + (f"; hardly: {missing}" if missing else "")
-    table.add_row("image area seen", seen)
-    up, side = np.abs(camera.tilts).max(axis=0)
-    table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
-    return table
+def _draw(out: Path, file: str, name: str, camera: CameraCalibration) -> Path:
+    write_picture(out / f"{file}.png", draw_calibration(name, camera))
+    return out / f"{file}.png"
 
 
 def as_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
-    """The same for programs."""
+    """What came out, for programs."""
     cameras, rig = {}, None
     for name, camera in found.cameras.items():
-        views = gathered[name]
+        views, k = gathered[name], camera.intrinsics
         cameras[name] = {
-            "size": [camera.intrinsics.width, camera.intrinsics.height],
-            "estimated": camera.estimated,
-            **_values(camera),
+            "size": [k.width, k.height],
+            "estimated": bool(camera.sigmas),
+            **{key: getattr(k, key) for key in ("fx", "fy", "cx", "cy")},
+            **dict(zip(COEFFICIENT_NAMES, k.distortion, strict=False)),
             "sigmas": camera.sigmas,
             "rms_px": camera.rms_px,
             "images": {"looked_at": views.images, "with_board": views.seen, "left_out": list(camera.left_out)},
             "errors_px": {view.name: error for view, error in zip(camera.views, camera.errors_px, strict=True)},
             "cells_seen": int(np.count_nonzero(camera.counts)),
             "cells": CELLS * CELLS,
+            "hardly_seen": missing_regions(camera.counts),
             "leaned_deg": np.abs(camera.tilts).max(axis=0).tolist(),
         }
-    if found.rig is not None:
-        places = {n: asdict(p) | {"T_rig_camera": p.T_rig_camera.tolist()} for n, p in found.rig.cameras.items()}
-        rig = {"rms_px": found.rig.rms_px, "cameras": places}
+    if found.rig:
+        places = {n: asdict(p) | {"T_rig_camera": p.T_rig_camera.tolist()} for n, p in found.rig.items()}
+        rig = {"rms_px": found.rig_rms_px, "cameras": places}
     return {"cameras": cameras, "rig": rig, "files": [str(path) for path in files]}
+
+
+def tables(told: dict[str, Any]) -> Iterator[Table]:
+    """What ``as_json`` tells, for people."""
+    for name, camera in told["cameras"].items():
+        width, height = camera["size"]
+        table = Table(title=f"{name}, {width} x {height}", title_justify="left", show_header=False)
+        table.add_column()
+        table.add_column(overflow="fold")
+        images, errors, left_out = camera["images"], camera["errors_px"], camera["images"]["left_out"]
+        used = f"{len(errors)} used" + (f"; {len(left_out)} did not fit: {', '.join(left_out)}" if left_out else "")
+        table.add_row("images", f"{images['looked_at']} looked at, {images['with_board']} with the board, {used}")
+        table.add_row("error", f"{camera['rms_px']:.3f} px RMS")
+        worst = sorted(errors.items(), key=lambda item: -item[1])[:_WORST]
+        table.add_row("worst images", ", ".join(f"{view} {error:.2f} px" for view, error in worst))
+        for key in ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES):
+            if key in camera:
+                sigma = f" +- {camera['sigmas'][key]:.2g}" if camera["estimated"] else " as the source gives it"
+                table.add_row(key, f"{camera[key]:.{5 if key in COEFFICIENT_NAMES else 2}f}{sigma}")
+        missing = f"; hardly: {', '.join(camera['hardly_seen'])}" if camera["hardly_seen"] else ""
+        table.add_row("image area seen", f"{camera['cells_seen']} of {camera['cells']} cells{missing}")
+        up, side = camera["leaned_deg"]
+        table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
+        yield table
+    if told["rig"] is not None:
+        caption = f"{told['rig']['rms_px']:.3f} px RMS of all corners at once"
+        titles = ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg")
+        table = Table(*titles, title="rig", title_justify="left", caption=caption)
+        for name, place in told["rig"]["cameras"].items():
+            T = np.array(place["T_rig_camera"])
+            position = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
+            turned = np.degrees(np.linalg.norm(rotation_vector(T)))
+            sigmas = f"{1000 * place['position_sigma_m']:.2f}", f"{place['turn_sigma_deg']:.3f}"
+            table.add_row(name, str(place["moments"]), position, sigmas[0], f"{turned:.2f}", sigmas[1])
+        yield table

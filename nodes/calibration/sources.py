@@ -24,7 +24,6 @@ from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.camera import halves
 from semantic_mapper.errors import CameraError, ConfigError
-from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.options import SOURCE_PATTERN
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.sequence import open_log
@@ -39,10 +38,11 @@ _KEEPS_INTRINSICS = ("oak", "realsense")  # rectifies with what its maker has me
 _log = structlog.get_logger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Source:
     """Images of one camera or, of a log, of several."""
 
+    name: str  # of the camera; a log names its cameras itself
     # gives them with what to call each, to the end; a live camera's until ``stop``
     images: Callable[[], Iterator[tuple[str, CameraImage]]]
     live: bool = False  # it has no end
@@ -51,49 +51,38 @@ class Source:
     stop: Callable[[], None] = lambda: None  # ends ``images`` soon, from any thread
 
 
-def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
+def parse_sources(texts: Sequence[str], size: str, *, stereo: bool = False) -> list[Source]:
     """Sources as ``[NAME=]PLACE``, see ``calibrate``; ``size`` as "WIDTHxHEIGHT" to ask of V4L2 cameras, or empty.
+
+    With ``stereo`` a single one that gives the images of two cameras side by side (``size``: of both together).
 
     Raises ConfigError: not a place, no name for a camera, or two cameras of one name. CameraError, DependencyError: a
     camera that cannot be opened.
     """
-    named = [_split(text, alone=len(texts) == 1) for text in texts]
+    if stereo and len(texts) != 1:
+        raise ConfigError("--stereo calibrates one device that gives both images side by side; name one")
+    alone = ("stereo" if stereo else "camera") if len(texts) == 1 else ""
+    named = [_split(text, alone) for text in texts]
+    names = [name for name, place in named if not place.endswith(".mcap")]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"two cameras have one name in {', '.join(names)}; write NAME=PLACE")
     stems = sorted({file.stem for _, place in named if Path(place).is_dir() for file in _pictures(Path(place))})
     found: list[Source] = []
-    names: list[str] = []
     for name, place in named:
         if Path(place).is_dir():
-            found.append(Source(partial(_folder_images, name, Path(place), stems), stream=False))
+            found.append(Source(name, partial(_folder_images, name, Path(place), stems), stream=False))
         elif place.endswith(".mcap"):
-            found.append(Source(partial(_log_images, Path(place))))
-            continue  # names its cameras itself
+            found.append(Source(name, partial(_log_images, Path(place))))
         else:
             found.append(_camera_source(name, place, size))
-        names.append(name)
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ConfigError(f"two cameras are called '{twice[0]}'; name them: left={named[0][1]} right={named[1][1]}")
-    return found
+    return [replace(s, images=partial(_halves, s), known=False) for s in found] if stereo else found
 
 
-def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, list[Source]]:
-    """A stereo pair that gives both images side by side, as ``[NAME=]PLACE``: its name, and its halves as two cameras.
-
-    As of ``parse_sources``, with the ``size`` of both together; ``ConfigError`` for more than one source.
-    """
-    if len(texts) != 1:
-        raise ConfigError("--stereo calibrates one device that gives both images side by side; name one")
-    name, _ = _split(texts[0], alone=True)
-    (source,) = parse_sources(texts, size)
-    pair = replace(source, images=partial(_halves, source), known=False)
-    return "stereo" if name == "camera" else name, [pair]
-
-
-def _split(text: str, *, alone: bool) -> tuple[str, str]:
+def _split(text: str, alone: str) -> tuple[str, str]:
     name, equals, place = text.partition("=")
     if not equals or "/" in name or ":" in name:
         name, place = "", text
-    name = name or ("camera" if alone else re.sub(r"[^A-Za-z0-9_.-]", "-", Path(place).stem) or "camera")
+    name = name or alone or re.sub(r"[^A-Za-z0-9_.-]", "-", Path(place).stem) or "camera"
     if not re.match(SOURCE_PATTERN, name):
         raise ConfigError(f"'{name}' cannot be the name of a camera: use letters, digits and any of _ . -")
     return name, place
@@ -118,7 +107,7 @@ def _camera_source(name: str, place: str, size: str) -> Source:
             raise ConfigError(f"--size {size:.40}: write WIDTHxHEIGHT, such as 1280x720")
         config["width"], config["height"] = int(found[1]), int(found[2])
     camera = open_camera(kind, config, name, place)
-    return Source(partial(_camera_images, camera), live=not camera.can_wait, known=known, stop=camera.stop)
+    return Source(name, partial(_camera_images, camera), live=not camera.can_wait, known=known, stop=camera.stop)
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -181,32 +170,41 @@ class Gathering:
 
         Raises CameraError, LogError: a source fails.
         """
-        for source in sources:
-            if not source.live:
-                with frame_progress("looked at", None, "images") as bar:
-                    self._take_all(source, stop, bar.advance)
         live = [source for source in sources if source.live]
-        if live and not stop:
-            self._listen(live, stop, seconds, rig=rig)
+        recorded = [source for source in sources if not source.live]
+        deadline = time.monotonic() + seconds
+        with ThreadPoolExecutor(len(live) + 1) as pool:
+            work = [pool.submit(self._take_all, part, stop) for part in (recorded, *([source] for source in live))]
+            while not stop and not (live and time.monotonic() > deadline):
+                done, going = wait(work, REPORT_S, FIRST_EXCEPTION)
+                lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
+                kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
+                _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
+                if not going or (live and not lacks) or any(each.exception() for each in done):
+                    break
+            for source in live:
+                source.stop()
+        for each in work:
+            each.result()
 
     def lacks(self, *, rig: bool) -> list[str]:
         """What is still missing, as sentences with the camera's name."""
-        lacks_text = [f"{name}: {lack}" for name, views in list(self.cameras.items()) for lack in views.lacks()]
-        if rig:
-            shared = len(simultaneous({n: list(v.steady) for n, v in list(self.cameras.items())}))
-            needed = MIN_INSTANTS + SPARE_INSTANTS
-            if shared < needed:
-                lacks_text.append(
-                    f"{shared} moments at which several cameras saw the board held still; {needed} are awaited"
-                )
-        return lacks_text
+        cameras = dict(self.cameras)
+        lacks = [f"{name}: {lack}" for name, views in cameras.items() for lack in views.lacks()]
+        shared, needed = (
+            len(simultaneous({n: list(v.steady) for n, v in cameras.items()})),
+            MIN_INSTANTS + SPARE_INSTANTS,
+        )
+        if rig and shared < needed:
+            lacks.append(f"{shared} moments at which several cameras saw the board held still; {needed} are awaited")
+        return lacks
 
-    def _take_all(self, source: Source, stop: StopRequest, advance: Callable[[], None] = lambda: None) -> None:
-        for name, image in source.images():
-            self._camera(image.camera_id, source).take(image, name)
-            advance()
-            if stop:
-                return
+    def _take_all(self, sources: Sequence[Source], stop: StopRequest) -> None:
+        for source in sources:
+            for name, image in source.images():
+                self._camera(image.camera_id, source).take(image, name)
+                if stop:
+                    return
 
     def _camera(self, camera_id: str, source: Source) -> ViewGatherer:
         with self._mutex:
@@ -215,20 +213,3 @@ class Gathering:
                 if source.known:
                     self.known.add(camera_id)
             return self.cameras[camera_id]
-
-    def _listen(self, sources: Sequence[Source], stop: StopRequest, seconds: float, *, rig: bool) -> None:
-        """Raises: CameraError: a camera cannot be opened or fails."""
-        deadline = time.monotonic() + seconds
-        with ThreadPoolExecutor(len(sources)) as pool:
-            work = [pool.submit(self._take_all, source, stop) for source in sources]
-            while not stop and time.monotonic() < deadline:
-                done, going = wait(work, REPORT_S, FIRST_EXCEPTION)
-                lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
-                kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
-                _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
-                if not lacks or not going or any(each.exception() for each in done):
-                    break
-            for source in sources:
-                source.stop()
-        for each in work:
-            each.result()

@@ -15,13 +15,11 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.calibration import report
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
-from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
+from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources
 from semantic_mapper.nodes.cli.verb import JsonOutput, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.run_folder import folder_for_results, prepare_file
-
-_WORST = 3  # views named in the report
 
 
 @verb
@@ -60,7 +58,7 @@ def calibrate(
         raise typer.BadParameter("name a camera, video, log or folder; or --board FILE.png to print a board")
     with folder_for_results(out):
         gathered = Gathering(settings.board, settings.calibration)
-        name, places = parse_stereo(sources, size) if stereo else ("", parse_sources(sources, size))
+        places = parse_sources(sources, size, stereo=stereo)
         with StopRequest() as stop:
             gathered.run(places, stop, seconds, rig=stereo or len(places) > 1)
         rig = len(gathered.cameras) > 1
@@ -69,10 +67,14 @@ def calibrate(
             names = ", ".join(keep) or "none"
             raise ConfigError(f"{names}: calibrated by its maker already; name several cameras to find where they sit")
         found = solve(gathered.cameras, keep, settings.calibration, rig=rig)
-        files = report.write_stereo(out, name, found, settings) if stereo else report.write_files(out, found, settings)
-    for part in (*report.tables(found, gathered.cameras, _WORST), *files):
+        if stereo:
+            files = report.write_stereo(out, places[0].name, found, settings)
+        else:
+            files = report.write_files(out, found, settings)
+    told = report.as_json(found, gathered.cameras, files)
+    for part in (*report.tables(told), *files):
         output.print(part)
-    output.json(report.as_json(found, gathered.cameras, files))
+    output.json(told)
 
 
 def board_settings(path: Path | None, square_mm: float) -> CalibrationSettings:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.drivers import live
-from semantic_mapper.drivers.oak import camera, device
+from semantic_mapper.drivers import live, registry
+from semantic_mapper.drivers.oak import camera
 from tests.drivers.oak import host
 
 
@@ -18,7 +18,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "QUEUE", 64)
     monkeypatch.setattr(camera, "QUEUE", 64)
     monkeypatch.setattr(camera, "ODOMETRY_WAIT_S", 20.0)
-    monkeypatch.setattr(device, "SEARCH_S", 0.1)
+    monkeypatch.setattr(registry, "SEARCH_S", 0.1)
 
 
 @pytest.fixture(scope="session")

@@ -119,18 +119,14 @@ def played(
     """Sources that send these messages."""
     pipeline = dai.Pipeline(False)
     colour = pipeline.create(Player, rgb, period_s=period_s, ends=ends, pipeline=pipeline)
-    outputs = [colour.output]
+    outputs = {"rgb": colour.output}
     if depth is not None:
-        outputs.append(pipeline.create(Player, depth, period_s=period_s, ends=False, pipeline=pipeline).output)
-    return Sources(
-        pipeline=pipeline,
-        device=None,
-        rgb=outputs[0],
-        depth=outputs[1] if depth is not None else None,
-        calibration=dai.CalibrationHandler(calibration),
-        name=NAME,
-        address="1844301000000000",
-    )
+        outputs["depth"] = pipeline.create(Player, depth, period_s=period_s, ends=False, pipeline=pipeline).output
+    return sources_of(pipeline, outputs, calibration)
+
+
+def sources_of(pipeline: dai.Pipeline, outputs: dict[str, Any], calibration: Path) -> Sources:
+    return Sources(pipeline, None, outputs, dai.CalibrationHandler(calibration), NAME, "1844301000000000")
 
 
 def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> LiveCamera:
@@ -150,15 +146,7 @@ def replayed(folder: Path, calibration: Path) -> Sources:
     depth = pipeline.create(dai.node.ReplayMessage)
     depth.setReplayFile(folder / "depth.mcap")
     depth.setLoop(False)
-    return Sources(
-        pipeline=pipeline,
-        device=None,
-        rgb=rgb.out,
-        depth=depth.out,
-        calibration=dai.CalibrationHandler(calibration),
-        name=NAME,
-        address="1844301000000000",
-    )
+    return sources_of(pipeline, {"rgb": rgb.out, "depth": depth.out}, calibration)
 
 
 class SlowTracker(dai.node.ThreadedHostNode):
@@ -195,12 +183,7 @@ def tracked(
     pairs = [[rgb_message(k, start, dai.ImgFrame.Type.BGR888i) for k in range(100)] for _ in range(2)]
     sides = [pipeline.create(Player, side, period_s=1 / FPS, ends=False, pipeline=pipeline) for side in pairs]
     tracker = pipeline.create(SlowTracker, pose_of, slowness_s)
-    ports = OdometryPorts(
-        left_out=sides[0].output,
-        right_out=sides[1].output,
-        left_in=tracker.left,
-        right_in=tracker.right,
-        pose_out=tracker.output,
-        T_left_rgb=T_left_rgb,
-    )
+    pair = {"left": sides[0].output, "right": sides[1].output}
+    inputs = {"left": tracker.left, "right": tracker.right}
+    ports = OdometryPorts(pair, inputs, tracker.output, T_left_rgb)
     return replace(sources, odometry=ports)

@@ -17,7 +17,7 @@ from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.nodes.calibration.report import CalibrationSettings, as_json, tables, write_files
-from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources, parse_stereo
+from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
@@ -70,12 +70,11 @@ def test_a_rig_is_written_into_the_files_of_its_cameras(pictures: Path, tmp_path
     assert [f.name for f in files] == ["left.toml", "left.png", "right.toml", "right.png"]
     mount = load_mount(tmp_path / "right.toml")
     assert mount is not None and np.allclose(mount, np.eye(4), atol=1e-6)
-    assert found.rig is not None
-    np.testing.assert_array_equal(mount, found.rig.cameras["right"].T_rig_camera)
+    np.testing.assert_array_equal(mount, found.rig["right"].T_rig_camera)
     assert load_calibration(tmp_path / "left.toml") == found.cameras["left"].intrinsics
     told = as_json(found, gathered.cameras, files)
     assert json.loads(json.dumps(told)) == told and told["rig"]["cameras"]["left"]["moments"] > 8
-    assert len(list(tables(found, gathered.cameras, 3))) == 3
+    assert len(list(tables(told))) == 3
 
 
 def test_a_log_names_its_cameras_itself(tmp_path: Path) -> None:
@@ -94,9 +93,8 @@ def test_a_log_names_its_cameras_itself(tmp_path: Path) -> None:
 def test_a_live_camera_is_looked_through_until_nothing_is_lacking(tmp_path: Path) -> None:
     film = write_film(tmp_path / "film.avi", [image.rgb for _, image in shown() for _ in range(2)], 30)
     (source,) = parse_sources([str(film)], "")
-    source.live = True
     gathering = Gathering(BOARD, CalibrationConfig())
-    gathering.run([source], StopRequest(), 120.0, rig=False)
+    gathering.run([dataclasses.replace(source, live=True)], StopRequest(), 120.0, rig=False)
     assert gathering.lacks(rig=False) == [] and gathering.cameras["camera"].images <= 40
     assert "several cameras saw the board held still" in gathering.lacks(rig=True)[0]
     assert len(gathering.cameras["camera"].kept) >= SETTINGS.calibration.min_views
@@ -172,8 +170,8 @@ def test_what_is_no_source_is_told(pictures: Path, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=says):
             parse_sources([text], "")
     with pytest.raises(ConfigError, match="--stereo calibrates one device"):
-        parse_stereo([str(pictures), str(pictures)], "")
-    with pytest.raises(ConfigError, match="two cameras are called 'front'"):
+        parse_sources([str(pictures), str(pictures)], "", stereo=True)
+    with pytest.raises(ConfigError, match="two cameras have one name in front, front"):
         parse_sources([str(pictures), str(pictures)], "")
     with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
         parse_sources(["v4l2:/dev/video0"], "large")
