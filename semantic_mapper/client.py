@@ -157,17 +157,14 @@ class MapClient(Closing):
 
         The mapper begins it once, also where an answer is lost and the request is sent again.
 
+        Raises MapError: the mapper keeps no history (``history.max_frames``), or no frame has such a stamp. PoseError:
+        a pose is not a rigid transform. ShapeError: a pose is not of shape (4, 4). In every case nothing has changed.
+
         Args:
             poses, until_ns: As of ``MapCorrector.start``, but each pose in the world that its frame came in
                 (``PosedFrame.world``), not in the map's; at most 65536 at once.
             within_ns: Poses go to the frames nearest in time, if those are so near, and are left out where none is; 0 =
                 every pose must have the stamp of a frame.
-
-        Raises:
-            MapError: the mapper keeps no history (``history.max_frames``), or no frame has such a stamp.
-            PoseError: a pose is not a rigid transform.
-            ShapeError: a pose is not of shape (4, 4).
-            In every case nothing has changed.
         """
         keys = [key if isinstance(key, tuple) else ("", key) for key in poses]
         cameras = tuple(dict.fromkeys(camera for camera, _ in keys)) or ("",)
@@ -192,10 +189,8 @@ class MapClient(Closing):
         return self._ask(questions.WeightsRequest())
 
     def return_to_weights(self, version: int) -> Weights:
-        """Ask the mapper to go back to weights that it has used before, which it does a moment later.
-
-        Raises MapError: it has never used these, or keeps them no longer.
-        """
+        """Ask the mapper to go back to weights that it has used before, which it does a moment later. Raises MapError:
+        it has never used these, or keeps them no longer."""
         return self._ask(questions.WeightsRequest(to=version))
 
     def close(self) -> None:

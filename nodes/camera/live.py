@@ -133,10 +133,8 @@ class _LiveNode:
         self._report("ended")
 
     def open(self, live: LiveCamera, stack: ExitStack) -> PosedCamera | None:
-        """An open source, which ``stack`` closes; None where a stop request came first.
-
-        Raises CameraError: it could not be opened within ``live.open_s``.
-        """
+        """An open source, which ``stack`` closes; None where a stop request came first. Raises CameraError: it could
+        not be opened within ``live.open_s``."""
         began, pause_s = time.monotonic(), FIRST_PAUSE_S
         while not self._context.stop:
             source = make_source(live)

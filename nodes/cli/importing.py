@@ -75,11 +75,8 @@ class SourceOptions(Options, frozen=True):
         return FilmOptions(self.calibration, self.focal_prior or None, hint, self.quarters)
 
     def recording_scale(self) -> float | None:
-        """Metres per unit, of a recording that has poses.
-
-        Raises:
-            typer.BadParameter: options were given that are for films alone.
-        """
+        """Metres per unit, of a recording that has poses. Raises typer.BadParameter: options were given that are for
+        films alone."""
         if msgspec.structs.replace(self, scale=0.0, rotate="0").given:
             raise typer.BadParameter(
                 "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, "
@@ -150,11 +147,7 @@ def import_source(
     overwrite: bool,
 ) -> int:
     """Import a film or a recording, with progress, and say what became of it; how many frames have measured depth.
-
-    Raises:
-        typer.BadParameter: options that do not go with the source.
-        SemanticMapperError: it cannot be imported.
-    """
+    Raises typer.BadParameter: options that do not go with the source. SemanticMapperError: it cannot be imported."""
     if format_name is None and is_film(source):
         _import_film(output, source, log, options.film_options(), overwrite=overwrite)
         return 0

@@ -39,10 +39,8 @@ def suggest_for_log(
     Labelled are frames with a label image in the folder and those that the weights have learned from; and frames with
     labels of the log's own, unless all have some.
 
-    Raises:
-        LogError: no frame can be read.
-        WeightsError: there are no such weights.
-        KeyboardInterrupt: a stop request came.
+    Raises LogError: no frame can be read. WeightsError: there are no such weights. KeyboardInterrupt: a stop request
+    came.
     """
     stamps = frozenset[int]() if weights is None else load_checkpoint(weights).train_stamps_ns
     painted = frozenset(() if images is None else images.numbers())
@@ -110,10 +108,8 @@ def choose_keyframes(
 
     Without images, those ``count`` of its labelled frames that together show most of what it shows.
 
-    Raises:
-        LogError: the log, a frame or the labels of one are missing.
-        LabelError: nobody knows what the labels mean.
-        KeyboardInterrupt: a stop request came.
+    Raises LogError: the log, a frame or the labels of one are missing. LabelError: nobody knows what the labels mean.
+    KeyboardInterrupt: a stop request came.
     """
     with open_log(path) as log:
         folder = None if images is None else open_label_folder(images, log)

@@ -136,17 +136,13 @@ class SettingOptions:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What the command line says, by names of settings.
-
-        Raises ConfigError: ``--set`` is not of the form NAME=VALUE.
-        """
+        """What the command line says, by names of settings. Raises ConfigError: ``--set`` is not of the form
+        NAME=VALUE."""
         return self._named | parse_assignments(self._assigned)
 
     def table(self) -> dict[str, Any]:
-        """File and command line together, as a TOML file would have them.
-
-        Raises ConfigError: a file that is no TOML, or ``given`` is not.
-        """
+        """File and command line together, as a TOML file would have them. Raises ConfigError: a file that is no TOML,
+        or ``given`` is not."""
         data = read_toml(self.path) if self.path else {}
         for name, value in self.given.items():
             assign(data, name, value, "--set")
@@ -252,11 +248,8 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
 
 
 def refuse_options(*rules: tuple[object, str, str]) -> None:
-    """Refuse options that do not go together: whether they are wrong, their names, and why.
-
-    Raises:
-        typer.BadParameter: the first that are wrong.
-    """
+    """Refuse options that do not go together: whether they are wrong, their names, and why. Raises typer.BadParameter:
+    the first that are wrong."""
     for wrong, options, why in rules:
         if wrong:
             raise typer.BadParameter(why, param_hint=options)
@@ -295,21 +288,16 @@ def _sentence(text: str) -> str:
 
 
 def results_file(out: Path | None) -> Path | None:
-    """The file that ``--out`` names.
-
-    Raises:
-        typer.BadParameter: the file is there and is no JSON, such as weights that were named by mistake.
-    """
+    """The file that ``--out`` names. Raises typer.BadParameter: the file is there and is no JSON, such as weights that
+    were named by mistake."""
     if out is not None and out.is_file() and out.suffix != ".json":
         raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
     return out
 
 
 def must_be_there(*paths: Path) -> None:
-    """Refuse what is missing, or neither a file nor a folder, before the packages that read it are loaded.
-
-    Raises LogError: one of them is.
-    """
+    """Refuse what is missing, or neither a file nor a folder, before the packages that read it are loaded. Raises
+    LogError: one of them is."""
     for path in paths:
         if not path.is_file() and not path.is_dir():
             what = "it is no regular file; copy its content to one" if path.exists() else "no such file or folder"

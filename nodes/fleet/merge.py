@@ -44,16 +44,13 @@ def merge_maps(
     The first map and those with a given pose are added in their order. Each other one is found by the places it shares
     with what was merged so far; found maps help to find others.
 
+    Raises ConfigError: a pose of no map. MapError: maps that do not fit each other, are the same, have seen the same
+    frames, or fit nowhere; or a map cannot be read. StoreError: a map cannot be fetched.
+
     Args:
         sources: Of ``find_maps``.
         given: T_world_map (4, 4) float64 by name. Without any, the world is that of the first map.
         on_added: Called after each map.
-
-    Raises:
-        ConfigError: a pose of no map.
-        MapError: maps that do not fit each other, are the same, have seen the same frames, or fit nowhere; or a map
-            cannot be read.
-        StoreError: a map cannot be fetched.
     """
     names = list(sources)
     if unknown := sorted(set(given) - set(names)):

@@ -45,10 +45,8 @@ class Tables:
     what only other results have is NULL. ``classes`` and ``events`` belong to it by ``key``. ``failures`` has a row for
     each log that failed and was not done since.
 
-    Raises:
-        ConfigError: a document is damaged.
-        StoreError: the store cannot be reached.
-        DependencyError: DuckDB is missing.
+    Raises ConfigError: a document is damaged. StoreError: the store cannot be reached. DependencyError: DuckDB is
+    missing.
     """
 
     def __init__(self, store: Store) -> None:

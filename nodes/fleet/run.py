@@ -130,17 +130,15 @@ def make_task(
 ) -> Task:
     """What to do with each log.
 
+    Raises ConfigError: a setting cannot be used (the nearest one is named), or no store can be there. WeightsError: the
+    weights cannot. StoreError: they cannot be fetched.
+
     Args:
         operation: Of ``OPERATIONS``.
         out: Path or URL of the store, which is made where nothing is.
         weights: File, URL, or name of weights that ship; None = the default ones.
         assignments: What ``--set NAME=VALUE`` says, such as ``max_frames=100`` or ``voxel_map.voxel_size_m=0.05``.
         config: TOML file with the same names; assignments go before it.
-
-    Raises:
-        ConfigError: a setting cannot be used (the nearest one is named), or no store can be there.
-        WeightsError: the weights cannot.
-        StoreError: they cannot be fetched.
     """
     found = OPERATIONS[operation]
     given = {} if config is None else read_toml(config)
@@ -265,10 +263,8 @@ def _read_weights(operation: str, weights: str) -> tuple[str, bytes]:
 def run_task(task: Task, log: LogInput) -> bool:
     """Do a task with a log; False where its result was there, or another attempt was quicker.
 
-    Raises:
-        StoreError: the store or the log cannot be reached.
-        FleetError: this worker has other code.
-        SemanticMapperError: the log, weights or settings cannot be used.
+    Raises StoreError: the store or the log cannot be reached. FleetError: this worker has other code.
+    SemanticMapperError: the log, weights or settings cannot be used.
     """
     began = time.monotonic()
     if code_digest() != task.code:

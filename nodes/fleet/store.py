@@ -100,14 +100,12 @@ RecordT = TypeVar("RecordT", bound=Record)
 class Store:
     """Reads and writes a store.
 
+    Raises ConfigError: no store is there, or one of another version. StoreError: it cannot be reached. DependencyError:
+    no package for this kind of URL.
+
     Args:
         url: Path or URL, such as ``runs/fleet`` or ``s3://bucket/fleet``.
         create: Make it where nothing is.
-
-    Raises:
-        ConfigError: no store is there, or one of another version.
-        StoreError: it cannot be reached.
-        DependencyError: no package for this kind of URL.
     """
 
     def __init__(self, url: str, *, create: bool = False) -> None:
@@ -231,10 +229,8 @@ def is_url(text: str) -> bool:
 def open_url(url: str) -> tuple[Any, str]:
     """The fsspec file system of a path or URL, and the path in it, without a slash at its end.
 
-    Raises:
-        ConfigError: no such scheme, or no address.
-        FleetError: a key, token or password in the URL.
-        DependencyError: the extra ``fleet``, or the package for this scheme, is missing.
+    Raises ConfigError: no such scheme, or no address. FleetError: a key, token or password in the URL. DependencyError:
+    the extra ``fleet``, or the package for this scheme, is missing.
     """
     try:
         from fsspec.core import url_to_fs

@@ -46,10 +46,9 @@ _log = structlog.get_logger(__name__)
 def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
     """Serve until all streams have ended or somebody asks to stop.
 
-    Raises:
-        DependencyError: the extra is not installed.
-        NodeError: the thread that sends the map has ended, by a bug; what it has said is in the log.
-        TransportError: the port is taken, a socket of the launch cannot be used, or there are no keys.
+    Raises DependencyError: the extra is not installed. NodeError: the thread that sends the map has ended, by a bug;
+    what it has said is in the log. TransportError: the port is taken, a socket of the launch cannot be used, or there
+    are no keys.
     """
     from semantic_mapper.nodes.foxglove.server import FoxgloveServer  # an extra, which may be missing
 

@@ -122,15 +122,13 @@ class LabelSession:
     def save(self, number: int, data: bytes, revision: str | None = None) -> None:
         """Write a label, as changed by a person.
 
+        Raises ChangedElsewhereError: somebody else has changed it since. LabelError: not a byte a pixel, or an id that
+        is no class. LogError: it cannot be written.
+
         Args:
             number: Of the frame.
             data: The label.
             revision: ``revision_of`` what the person changed; None = whatever is there is replaced.
-
-        Raises:
-            ChangedElsewhereError: somebody else has changed it since.
-            LabelError: not a byte a pixel, or an id that is no class.
-            LogError: it cannot be written.
         """
         with self._lock:
             height, width = self.size(number)

@@ -102,9 +102,7 @@ def launch_files() -> dict[str, Path]:
 
 def find_launch(path: Path) -> Path:
     """The launch file that ``path`` names, else that of the package which is called so ("replay" or "replay.toml").
-
-    Raises ConfigError: neither is there; lists those of the package.
-    """
+    Raises ConfigError: neither is there; lists those of the package."""
     if path.exists() and not path.is_dir():
         return path
     files = launch_files()
@@ -164,10 +162,8 @@ class _Overrides:
         self._path = path
 
     def apply(self, name: str, text: str) -> None:
-        """Replace a value.
-
-        Raises ConfigError: nothing is called so; or it belongs into a table that is named as a file.
-        """
+        """Replace a value. Raises ConfigError: nothing is called so; or it belongs into a table that is named as a
+        file."""
         first, *keys = name.split(".")
         node = self._nodes.get(first)
         settings = [f for f in LaunchFile.__struct_fields__ if f != "node"]
@@ -292,10 +288,8 @@ def _convert_options(node: NodeEntry, keys: str, path: Path) -> NodeOptions:
 
 
 def _check_camera(camera: dict[str, Any], node: str) -> None:
-    """Say at once, before a mapper has started, what the camera's own process would refuse much later.
-
-    Raises ValueError: no such kind of camera or of poses, or no poses at all.
-    """
+    """Say at once, before a mapper has started, what the camera's own process would refuse much later. Raises
+    ValueError: no such kind of camera or of poses, or no poses at all."""
     kind, poses = str(camera.get("kind") or ""), camera.get("poses")
     if kind not in CAMERA_KINDS:
         what = f"`camera.kind`: no kind of camera is called '{kind}'" if kind else "which kind of camera"

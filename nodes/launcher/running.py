@@ -87,10 +87,8 @@ def running_launches() -> list[Path]:
 
 
 def launch_folder(place: str) -> Path:
-    """The socket folder of a running launch; an empty place stands for the one launch that runs.
-
-    Raises TransportError: none runs, several do, or the folder is not that of a launch.
-    """
+    """The socket folder of a running launch; an empty place stands for the one launch that runs. Raises TransportError:
+    none runs, several do, or the folder is not that of a launch."""
     if place:
         if not (Path(place) / STATUS_SOCKET).exists():
             raise TransportError(f"{place}: no socket folder of a launch that runs; `up` names its own as it starts")
@@ -105,9 +103,7 @@ def launch_folder(place: str) -> Path:
 
 def socket_in_launch(place: str, name: str) -> str:
     """The endpoint ``name`` of a running launch, which is named as for ``launch_folder``; endpoints stay as they are.
-
-    Raises TransportError: as of ``launch_folder``.
-    """
+    Raises TransportError: as of ``launch_folder``."""
     return place if "://" in place else f"ipc://{launch_folder(place)}/{name}"
 
 
@@ -132,9 +128,7 @@ def map_endpoint(place: str) -> str:
 
 def node_endpoints(folder: Path) -> dict[str, str]:
     """Where the nodes of a running launch that have not ended publish, by name, as soon as all have said that they run.
-
-    Raises TransportError: the launcher says nothing, or not all nodes have come to run in time.
-    """
+    Raises TransportError: the launcher says nothing, or not all nodes have come to run in time."""
     known: dict[str, Status] = {}
     deadline = time.monotonic() + START_S
     status = f"ipc://{folder}/{STATUS_SOCKET}"

@@ -230,10 +230,8 @@ def pack_header(header: Mapping[str, Any], what: str) -> bytes:
 
 
 def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
-    """msgpack -> plain fields without the protocol's version, not checked any further.
-
-    Raises CodecError: too long, not msgpack, nested too deeply, no map, or of another protocol version.
-    """
+    """msgpack -> plain fields without the protocol's version, not checked any further. Raises CodecError: too long, not
+    msgpack, nested too deeply, no map, or of another protocol version."""
     if len(packed) > MAX_HEADER_BYTES:
         raise CodecError(f"{what}: header of {len(packed)} bytes, at most {MAX_HEADER_BYTES} are accepted")
     try:

@@ -178,10 +178,8 @@ def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:
 
 
 def decode_image_file(data: bytes, expected: tuple[int, int] | None = None) -> tuple[UInt8, Literal["png", "jpeg"]]:
-    """A JPEG or PNG file, of the ``expected`` (height, width) if given -> (H, W, 3) uint8 RGB and its encoding.
-
-    Raises CodecError: neither, damaged, cut off, or of another size.
-    """
+    """A JPEG or PNG file, of the ``expected`` (height, width) if given -> (H, W, 3) uint8 RGB and its encoding. Raises
+    CodecError: neither, damaged, cut off, or of another size."""
     encoding, size = sniff_image(data)
     if expected is not None and size != expected:
         raise CodecError(f"the header announces {expected[1]}x{expected[0]}, the data are {size[1]}x{size[0]}")
@@ -195,10 +193,8 @@ def decode_image_file(data: bytes, expected: tuple[int, int] | None = None) -> t
 
 
 def sniff_image(data: bytes) -> tuple[Literal["png", "jpeg"], tuple[int, int]]:
-    """Encoding and (height, width) of an image file, without decoding it.
-
-    Raises CodecError: neither PNG nor JPEG, or cut off before its end mark.
-    """
+    """Encoding and (height, width) of an image file, without decoding it. Raises CodecError: neither PNG nor JPEG, or
+    cut off before its end mark."""
     if data.startswith(_PNG_MAGIC) and len(data) >= 33 and data[12:16] == b"IHDR":
         width, height = struct.unpack(">II", data[16:24])
         _check_png(data)

@@ -74,8 +74,7 @@ def receive_bounded(
     socket: zmq.Socket[bytes], *, max_parts: int = MAX_PARTS, max_bytes: int = MAX_MESSAGE_BYTES, flags: int = 0
 ) -> tuple[list[bytes], str]:
     """The parts of the next message, all of which is taken off the socket, and an empty text; of a message beyond the
-    limits the parts before the first that is too much, and why. ``zmq.Again`` where the flags say not to wait.
-    """
+    limits the parts before the first that is too much, and why. ``zmq.Again`` where the flags say not to wait."""
     parts: list[bytes] = []
     count = size = 0
     while not count or socket.getsockopt(zmq.RCVMORE):
@@ -130,10 +129,8 @@ class Publisher(Closing):
         self._pump_thread.start()
 
     def publish(self, parts: Parts, timeout_s: float = 30.0) -> None:
-        """Send one encoded message. The parts must not be changed afterwards.
-
-        Raises TransportError: closed; or policy "block" and a subscriber did not make room within ``timeout_s``.
-        """
+        """Send one encoded message. The parts must not be changed afterwards. Raises TransportError: closed; or policy
+        "block" and a subscriber did not make room within ``timeout_s``."""
         topic = bytes(parts[0])
         deadline = time.monotonic() + timeout_s
         while True:
@@ -565,10 +562,8 @@ class QuerySocket(Closing):
         self._socket = self._connect()
 
     def ask(self, parts: Sequence[Buffer]) -> list[bytes]:
-        """The parts of the answer.
-
-        Raises TransportError: closed, nobody has answered, or the answer is beyond all limits.
-        """
+        """The parts of the answer. Raises TransportError: closed, nobody has answered, or the answer is beyond all
+        limits."""
         with self._lock:
             for _ in range(self._attempts):
                 if self._closed:
