@@ -19,8 +19,8 @@ UDEV_RULE = (
 _BUSY = ("X_LINK_BOOTED", "X_LINK_GATE_BOOTED")
 _FIX = (
     "end the program that uses it, or plug it in again, with its own cable, into a USB 3 port. PoE: check that its "
-    "switch port gives power, that this machine has an address in its network, and that no firewall stops UDP and TCP ports "
-    "11490 and 11491; `device` may be its IP address, which also works through a router. `semantic-mapper doctor "
+    "switch port gives power, that this machine has an address in its network, and that no firewall stops UDP and TCP "
+    "ports 11490 and 11491; `device` may be its IP address, which also works through a router. `semantic-mapper doctor "
     f"--cameras` shows those that answer. Without permission on USB it does not show either: {UDEV_RULE}"
 )
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-import errno
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
 
 import semantic_mapper.drivers.v4l2.ioctls as ioctls
+from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.calibration import require_calibration
 from semantic_mapper.drivers.live import CaptureDevice, LiveCamera
 from semantic_mapper.drivers.v4l2.config import Config
@@ -62,7 +63,11 @@ class V4l2Device(CaptureDevice):
         size: tuple[int, int] | None,
     ) -> None:
         self._path = path
-        who, formats = _examine(path)
+        fix = "is it plugged in, is it a camera, and are you in the group `video`? `doctor --cameras` lists them"
+        with as_camera_error(f"{path}: no such camera", fix, OSError), ioctls.opened(path) as fd:
+            who, formats = ioctls.query_capability(fd), ioctls.list_formats(fd)
+        if not who.captures:
+            raise CameraError(f"{path}: no such camera: it is the metadata of {who.card}, or an output; {fix}")
         source = f"V4L2 {who.card} at {path}"
         capture = cv2.VideoCapture(str(path), cv2.CAP_V4L2)
         if not capture.isOpened():
@@ -82,11 +87,13 @@ class V4l2Device(CaptureDevice):
             self._notes.append(f"{source}: requested pixels as {config.fourcc}, it gives {given}; it offers {offer}")
         if abs(hz - config.fps) > RATE_TOLERANCE * config.fps:
             self._notes.append(f"{source}: requested {config.fps:g} images/s, it gives {hz:g} at this size and format")
-        try:
+        with (
+            ExitStack() as undo,
+            as_camera_error(f"{source}: went away while it was opened", "plug it in again", OSError),
+        ):
+            undo.callback(capture.release)
             self._notes += [f"{source}: {trouble}" for trouble in apply_controls(path, config)]
-        except OSError as error:
-            capture.release()
-            raise CameraError(f"{source}: went away while it was opened ({error.strerror})") from error
+            undo.pop_all()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -104,69 +111,44 @@ class V4l2Device(CaptureDevice):
         return arrived_ns if self._other_clock else min(stamp_ns, arrived_ns)
 
 
-def _examine(path: Path) -> tuple[ioctls.Capability, tuple[str, ...]]:
-    """Who it is and its pixel formats; raises CameraError: not there, not allowed, not a camera."""
-    lists = "`semantic-mapper doctor --cameras` lists them"
-    try:
-        with ioctls.opened(path) as fd:
-            who = ioctls.query_capability(fd)
-            formats = ioctls.list_formats(fd)
-    except FileNotFoundError as error:
-        raise CameraError(f"{path}: no such camera; is it plugged in? {lists}") from error
-    except PermissionError as error:
-        raise CameraError(f"{path}: no permission; add yourself to the group `video` and log in again") from error
-    except OSError as error:
-        kind = "is no video device" if error.errno in (errno.ENOTTY, errno.EINVAL) else "does not answer"
-        raise CameraError(f"{path}: {kind} ({error.strerror}); {lists}") from error
-    if not who.captures:
-        raise CameraError(f"{path}: gives no images (it is the metadata of {who.card}, or an output); {lists}")
-    return who, formats
-
-
-def apply_controls(path: Path, config: Config) -> tuple[str, ...]:
+def apply_controls(path: Path, config: Config) -> list[str]:
     """Set what the config asks for; one sentence for each control that did not follow.
 
     Controls that the config leaves automatic are set so: a camera keeps what was set before. Raises ``OSError`` where
     the device is gone.
     """
+    exposure = max(1, round(config.exposure_ms * 10)) if config.exposure_ms else None
+    white = config.white_balance_k or None
+    gain = config.gain if config.gain >= 0 else None
     warnings: list[str] = []
     with ioctls.opened(path) as fd:
         controls = ioctls.list_controls(fd)
         by_id = {control.id: control for control in controls.values()}
-
-        def put(setting: str, control: ioctls.Control, value: int) -> None:
-            span = f"{control.name} goes from {control.minimum} to {control.maximum}"
-            try:
-                ioctls.set_control(fd, control.id, value)
-                given = ioctls.get_control(fd, control.id)
-            except OSError as error:
-                reason = error.strerror or error
-                warnings.append(f"{setting}: it refuses {control.name} = {value} ({reason}); {span}")
-                return
-            if given != value:
-                warnings.append(f"{setting}: requested {control.name} = {value}, it has {given}; {span}")
-
-        def put_pair(setting: str, automatic: tuple[int, int | None], manual: tuple[int, int] | None) -> None:
-            """Control and value of each; the automatic mode first: while it is on, a device refuses the value."""
-            if automatic[0] in by_id:
-                control = by_id[automatic[0]]
-                put(setting, control, control.default if automatic[1] is None else automatic[1])
-            if manual is not None and manual[0] in by_id:
-                put(setting, by_id[manual[0]], manual[1])
-            elif manual is not None:
-                warnings.append(f"it has no control for {setting}")
-
-        exposure = (ioctls.EXPOSURE_ABSOLUTE, max(1, round(config.exposure_ms * 10))) if config.exposure_ms else None
-        put_pair("exposure_ms", (ioctls.EXPOSURE_AUTO, ioctls.EXPOSURE_MANUAL if exposure else None), exposure)
-        white = (ioctls.WHITE_BALANCE_TEMPERATURE, config.white_balance_k) if config.white_balance_k else None
-        put_pair("white_balance_k", (ioctls.AUTO_WHITE_BALANCE, int(white is None)), white)
-        if config.gain >= 0:
-            put_pair("gain", (ioctls.AUTOGAIN, 0), (ioctls.GAIN, config.gain))
-        for name, value in config.controls.items():
-            if name in controls:
-                put(name, controls[name], value)
-            else:
-                near = difflib.get_close_matches(name, controls, n=1, cutoff=0.5)
+        # Automatic modes first: while one is on, a device refuses the value. None: its default.
+        modes = [
+            ("exposure_ms", ioctls.EXPOSURE_AUTO, ioctls.EXPOSURE_MANUAL if exposure else None),
+            ("white_balance_k", ioctls.AUTO_WHITE_BALANCE, int(white is None)),
+            *([("gain", ioctls.AUTOGAIN, 0)] if gain is not None else []),
+        ]
+        values = [
+            ("exposure_ms", by_id.get(ioctls.EXPOSURE_ABSOLUTE), exposure),
+            ("white_balance_k", by_id.get(ioctls.WHITE_BALANCE_TEMPERATURE), white),
+            ("gain", by_id.get(ioctls.GAIN), gain),
+            *((name, controls.get(name), value) for name, value in config.controls.items()),
+        ]
+        wanted = [(s, by_id[mode], value) for s, mode, value in modes if mode in by_id]
+        for setting, control, value in [*wanted, *(row for row in values if row[2] is not None)]:
+            if control is None:
+                near = difflib.get_close_matches(setting, controls, n=1, cutoff=0.5)
                 hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(controls) or 'none'}"
-                warnings.append(f"it has no control '{name}'; {hint}")
-    return tuple(warnings)
+                warnings.append(f"it has no control '{setting}'; {hint}")
+                continue
+            value = control.default if value is None else value
+            try:
+                given = f"{ioctls.set_control(fd, control.id, value)}"
+            except OSError as error:
+                given = f"an error ({error.strerror or error})"
+            if given != f"{value}":
+                span = f"{control.name} goes from {control.minimum} to {control.maximum}"
+                warnings.append(f"{setting}: requested {control.name} = {value}, it has {given}; {span}")
+    return warnings

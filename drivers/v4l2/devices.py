@@ -46,11 +46,9 @@ def list_devices() -> list[FoundCamera]:
             found.append(FoundCamera("v4l2", who.card, str(stable_path(node)), note))
         except FileNotFoundError:  # gone again
             continue
-        except PermissionError:
-            note = "no permission: add yourself to the group `video` and log in again"
-            found.append(FoundCamera("v4l2", "?", str(node), note))
         except OSError as error:
-            found.append(FoundCamera("v4l2", "?", str(node), f"does not answer: {error.strerror}"))
+            note = f"does not answer: {error.strerror} (without permission: add yourself to the group `video`)"
+            found.append(FoundCamera("v4l2", "?", str(node), note))
     return found
 
 

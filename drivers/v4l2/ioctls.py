@@ -37,61 +37,29 @@ _FOURCC_BIG_ENDIAN = 1 << 31
 _MAX_ROWS = 1024  # a driver that never says that it is at the end shall not hang us
 
 
-class _Capability(ctypes.Structure):
-    _fields_ = (
-        ("driver", ctypes.c_char * 16),
-        ("card", ctypes.c_char * 32),
-        ("bus_info", ctypes.c_char * 32),
-        ("version", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("device_caps", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 3),
-    )
+_u32, _i32 = ctypes.c_uint32, ctypes.c_int32
+_text16, _text32 = ctypes.c_char * 16, ctypes.c_char * 32
 
 
-class _Format(ctypes.Structure):
-    _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("description", ctypes.c_char * 32),
-        ("pixelformat", ctypes.c_uint32),
-        ("mbus_code", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 3),
-    )
+def _structure(**fields: Any) -> Any:
+    return type("_Structure", (ctypes.Structure,), {"_fields_": tuple(fields.items())})
 
 
-class _FrameSize(ctypes.Structure):
-    """Of a discrete size the union begins with width and height."""
-
-    _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("pixelformat", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("size", ctypes.c_uint32 * 6),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
-
-
-class _QueryControl(ctypes.Structure):
-    _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("name", ctypes.c_char * 32),
-        ("minimum", ctypes.c_int32),
-        ("maximum", ctypes.c_int32),
-        ("step", ctypes.c_int32),
-        ("default_value", ctypes.c_int32),
-        ("flags", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
+_Capability = _structure(
+    driver=_text16, card=_text32, bus_info=_text32, version=_u32, capabilities=_u32, device_caps=_u32, rest=_u32 * 3
+)
+_Format = _structure(
+    index=_u32, type=_u32, flags=_u32, description=_text32, pixelformat=_u32, mbus_code=_u32, rest=_u32 * 3
+)
+# Of a discrete size the union begins with width and height.
+_FrameSize = _structure(index=_u32, pixelformat=_u32, type=_u32, size=_u32 * 6, rest=_u32 * 2)
+_QueryControl = _structure(
+    id=_u32, type=_u32, name=_text32, minimum=_i32, maximum=_i32, step=_i32, default=_i32, flags=_u32, rest=_u32 * 2
+)
+_ControlValue = _structure(id=_u32, value=_i32)
 
 
-class _ControlValue(ctypes.Structure):
-    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
-
-
-def _number(direction: int, number: int, kind: type[ctypes.Structure]) -> int:
+def _number(direction: int, number: int, kind: Any) -> int:
     return direction << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
 
 
@@ -145,22 +113,22 @@ def query_capability(fd: int) -> Capability:
 
 def list_formats(fd: int) -> tuple[str, ...]:
     """FOURCC of each pixel format that it offers."""
-    return tuple(fourcc_text(row.pixelformat) for row in _formats(fd))
+    return tuple(fourcc_text(pixels) for pixels in _formats(fd))
 
 
 def list_sizes(fd: int) -> tuple[tuple[int, int], ...]:
     """Width and height of each image size that it offers, the largest first; none of a device that scales freely."""
     sizes = {
         (row.size[0], row.size[1])
-        for kind in _formats(fd)
-        for row in _rows(fd, ENUM_FRAMESIZES, lambda i: _FrameSize(index=i, pixelformat=kind.pixelformat))  # noqa: B023
+        for pixels in _formats(fd)
+        for row in _rows(fd, ENUM_FRAMESIZES, lambda i: _FrameSize(index=i, pixelformat=pixels))  # noqa: B023
         if row.type == _FRAMESIZE_DISCRETE
     }
     return tuple(sorted(sizes, reverse=True))
 
 
-def _formats(fd: int) -> Iterator[Any]:
-    return _rows(fd, ENUM_FMT, lambda i: _Format(index=i, type=_BUF_TYPE_VIDEO_CAPTURE))
+def _formats(fd: int) -> list[int]:
+    return [r.pixelformat for r in _rows(fd, ENUM_FMT, lambda i: _Format(index=i, type=_BUF_TYPE_VIDEO_CAPTURE))]
 
 
 def _rows(fd: int, request: int, row_of: Callable[[int], Any]) -> Iterator[Any]:
@@ -184,8 +152,14 @@ def list_controls(fd: int) -> dict[str, Control]:
         last = row.id
         name = re.sub(r"[^a-z0-9]+", "_", _text(row.name).lower()).strip("_")
         if not row.flags & _CTRL_FLAG_DISABLED:
-            found[name] = Control(row.id, name, row.minimum, row.maximum, row.default_value)
+            found[name] = Control(row.id, name, row.minimum, row.maximum, row.default)
     return found
+
+
+def set_control(fd: int, control: int, value: int) -> int:
+    """Set a control; returns the value that it has then."""
+    fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
+    return get_control(fd, control)
 
 
 def get_control(fd: int, control: int) -> int:
@@ -193,11 +167,6 @@ def get_control(fd: int, control: int) -> int:
     row = _ControlValue(id=control)
     fcntl.ioctl(fd, G_CTRL, row)
     return row.value
-
-
-def set_control(fd: int, control: int, value: int) -> None:
-    """Set a control."""
-    fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
 
 
 def fourcc_text(code: int) -> str:

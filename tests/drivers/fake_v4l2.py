@@ -102,7 +102,7 @@ class Machine:
         elif request == ioctls.QUERYCTRL and (later := [i for i in sorted(controls) if i > told.id & 0x7FFFFFFF]):
             c = controls[later[0]]
             told.id, told.name = c.id, c.name.replace("_", " ").title().encode()
-            told.minimum, told.maximum, told.default_value, told.flags = c.minimum, c.maximum, c.default, 0
+            told.minimum, told.maximum, told.default, told.flags = c.minimum, c.maximum, c.default, 0
         elif request == ioctls.S_CTRL and told.id in controls:
             c = controls[told.id]
             if c is EXPOSURE and sensor.values.get(ioctls.EXPOSURE_AUTO, 3) != ioctls.EXPOSURE_MANUAL:

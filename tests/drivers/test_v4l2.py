@@ -170,24 +170,22 @@ def test_single_damaged_images_are_gaps_and_no_reason_to_start_anew(
     assert all(seq % 3 != 2 for seq in seqs) and seqs[-1] >= 10
 
 
-def test_a_device_in_use_or_that_is_none_is_told_apart(
+def test_a_device_in_use_or_that_is_none_is_told(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = machine.plug(Sensor(busy=True), 0)
-    with pytest.raises(CameraError, match="is another program using it"), v4l2(device, tmp_path):
-        pass
     metadata = machine.plug(Sensor(capabilities=METADATA), 1, link="usb-HD_Webcam-video-index1")
-    with pytest.raises(CameraError, match="gives no images"), v4l2(metadata, tmp_path):
-        pass
-    with pytest.raises(CameraError, match="is it plugged in"), v4l2(machine.dev / "video7", tmp_path):
-        pass
     (machine.dev / "video8").touch()
-    monkeypatch.undo()
-    with (
-        pytest.raises(CameraError, match="is no video device"),
-        v4l2(machine.dev / "video8", tmp_path),
-    ):  # by the kernel
-        pass
+    for path, says in (
+        (device, "is another program using it"),
+        (metadata, "it is the metadata of HD Webcam"),
+        (machine.dev / "video7", "no such camera: .*No such file.*is it plugged in"),
+        (machine.dev / "video8", "no such camera: .*is it a camera"),
+    ):
+        if path.name == "video8":
+            monkeypatch.undo()  # as the kernel says it
+        with pytest.raises(CameraError, match=says), v4l2(path, tmp_path):
+            pass
 
 
 def test_controls_are_set_automatic_ones_too(machine: Machine, tmp_path: Path) -> None:
@@ -216,7 +214,7 @@ def test_controls_that_do_not_follow_are_told(machine: Machine, tmp_path: Path) 
     assert "no control 'focus_absolut'; did you mean 'focus_absolute'?" in told
     bare = machine.plug(Sensor(controls=()), 1, link="usb-Bare-video-index0")
     with v4l2(bare, tmp_path, gain=3) as camera:
-        assert [t.split(": ", 1)[1] for t in camera.warnings] == ["it has no control for gain"]
+        assert "it has no control 'gain'; it has none" in camera.warnings[0]
 
 
 def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -> None:
