@@ -16,23 +16,24 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
 from semantic_mapper.config import Config, to_plain
-from semantic_mapper.errors import LabelError, SemanticMapperError, WeightsError
+from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 FORMAT = "semantic-mapper-weights"
 VERSION = 3
@@ -61,18 +62,23 @@ class Checkpoint:
     @property
     def width(self) -> int:
         """Image width that the field was trained at, in pixels."""
-        return int(self.recipe.get("width", DEFAULT_WIDTH))
+        return msgspec.convert(self.recipe, _Recipe).width
 
     @property
     def train_stamps_ns(self) -> frozenset[int]:
         """Stamps of the frames whose labels the field has seen; evaluation leaves them out."""
-        return frozenset(int(s) for s in self.recipe.get("train_stamps_ns", ()))
+        return frozenset(msgspec.convert(self.recipe, _Recipe).train_stamps_ns)
 
 
 COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
-
-
 SHIPPED = Path(str(resources.files("semantic_mapper"))) / "weights"
+
+
+class _Recipe(msgspec.Struct):
+    """The parts of a recipe that are read here."""
+
+    width: Annotated[int, msgspec.Meta(ge=4, le=MAX_WIDTH)] = DEFAULT_WIDTH
+    train_stamps_ns: list[int] = []
 
 
 def default_checkpoint_path() -> Path:
@@ -126,7 +132,7 @@ def describe(kind: str, config: Config, label_set: LabelSet, recipe: dict[str, A
         "version": str(VERSION),
         "field": kind,
         "model_config": json.dumps(to_plain(config)),
-        "label_set": pack_label_set(label_set),
+        "label_set": msgspec.json.encode(label_set).decode(),
         "recipe": json.dumps(recipe),
     }
 
@@ -143,7 +149,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     tensors, metadata = open_weights(path)
     with refusing_damage(path):
         label_set = unpack_label_set(metadata["label_set"])
-        recipe = _checked_recipe(json.loads(metadata["recipe"]))
+        recipe = json.loads(metadata["recipe"])
+        msgspec.convert(recipe, _Recipe)
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
         kind = metadata["field"]
         if kind == MAP_KIND:
@@ -158,7 +165,7 @@ def refusing_damage(path: Path) -> Generator[None]:
     """Meanwhile the metadata of a file is read. Raises WeightsError: it is damaged."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
 
@@ -179,9 +186,7 @@ def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path)
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
     Raises WeightsError: missing, damaged, of another format or version, or its base is."""
-    if path.exists() and not path.is_file():
-        raise WeightsError(f"{path}: is no regular file; copy its content to one")
-    if not path.exists():
+    if not path.is_file():
         raise WeightsError(
             f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine "
             f"maps `semantic-mapper-research train --kind {MAP_KIND}`)"
@@ -192,19 +197,13 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 - not a dict
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file ({error}); fetch or train it again") from error
-    if metadata.get("format") != FORMAT:
-        raise WeightsError(
-            f"{path}: a safetensors file, but not weights of this project (no '{FORMAT}' in its metadata)"
-        )
-    if metadata.get("version") != str(VERSION):
-        raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
+    found = metadata.get("format"), metadata.get("version")
+    if found != (FORMAT, str(VERSION)):
+        raise WeightsError(f"{path}: not weights of this project that this version reads ({FORMAT} {VERSION})")
     if "base" in metadata:
         base = shipped_checkpoint(Path(metadata["base"]))
         if base is None or base == path:
-            raise WeightsError(
-                f"{path}: holds what differs from the weights '{metadata['base']}', which do not ship with this "
-                "version; install the package again, or use another file"
-            )
+            raise WeightsError(f"{path}: needs the weights '{metadata['base']}', which do not ship with this version")
         tensors = open_weights(base)[0] | tensors
     return tensors, metadata
 
@@ -212,20 +211,13 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
 def check_same_shape(path: Path, like: Checkpoint) -> None:
     """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
     Raises WeightsError: no weights file, or one of another network or of other classes."""
-    try:
-        with safe_open(path, framework="pt") as stored:
-            metadata = dict(stored.metadata() or {})
-        label_set = unpack_label_set(metadata["label_set"])
-        kind = metadata["field"]
-        shape = kind, json.loads(metadata["model_config"])
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
-        raise WeightsError(f"{path.name}: not readable as weights of this project ({error})") from error
-    if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config)))):
-        raise WeightsError(f"{path.name}: of another network than those in use; finetune these, not others")
-    if label_set != like.label_set:
+    _, metadata = open_weights(path)
+    with refusing_damage(path):
+        shape = metadata["field"], json.loads(metadata["model_config"]), unpack_label_set(metadata["label_set"])
+    if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config))), like.label_set):
         raise WeightsError(
-            f"{path.name}: of label set '{label_set.name}' ({len(label_set)} classes), those in use are of "
-            f"'{like.label_set.name}' ({len(like.label_set)})"
+            f"{path.name}: of another network than those in use, or of another label set than '{like.label_set.name}' "
+            f"({len(like.label_set)} classes); finetune those in use, not others"
         )
 
 
@@ -254,12 +246,12 @@ def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
 def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     """A frame at working width, with depth rounded as the file stores it."""
     intrinsics = working_intrinsics(frame.intrinsics, width)
-    spread = resize_spread(frame, intrinsics)
+    depth = None if frame.depth_m is None else resize_depth(frame, intrinsics)
     return replace(
         frame,
         rgb=resize_rgb(frame, intrinsics),
-        depth_m=None if frame.depth_m is None else _depth_from_units(_depth_to_units(resize_depth(frame, intrinsics))),
-        depth_sigma_m=None if spread is None else _depth_from_units(_depth_to_units(spread)),
+        depth_m=_depth_from_units(_depth_to_units(depth)),
+        depth_sigma_m=_depth_from_units(_depth_to_units(resize_spread(frame, intrinsics))),
         label=None if frame.label is None else resize_label(frame.label, intrinsics),
         label_is_pseudo=False,
         world=0,
@@ -267,40 +259,30 @@ def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     )
 
 
-def _checked_recipe(recipe: Any) -> dict[str, Any]:
-    """The recipe, if it is one whose parts that are read here can be. Raises ValueError, TypeError: it is not."""
-    if not isinstance(recipe, dict):
-        raise TypeError(f"the recipe is {type(recipe).__name__}, not a table")
-    if not 4 <= int(recipe.get("width", DEFAULT_WIDTH)) <= MAX_WIDTH:
-        raise ValueError(f"the recipe's width is {recipe['width']}")
-    _ = [int(stamp) for stamp in recipe.get("train_stamps_ns", ())]
-    return recipe
-
-
-def _depth_to_units(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _depth_to_units(depth_m: Float32 | None) -> NDArray[np.uint16] | None:
+    if depth_m is None:
+        return None
     return np.rint(np.clip(depth_m, 0, 65535 / DEPTH_UNITS_PER_M) * DEPTH_UNITS_PER_M).astype(np.uint16)
 
 
-def _depth_from_units(units: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    return units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
+def _depth_from_units(units: NDArray[np.uint16] | None) -> Float32 | None:
+    return None if units is None else units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
 
 
 def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor], str]:
     tensors: dict[str, torch.Tensor] = {}
     described: list[dict[str, Any]] = []
     for i, a in enumerate(anchors):
-        depths = {"depth": a.depth_m, "depth_sigma": a.depth_sigma_m}
         images = {"rgb": a.rgb, "label": a.label}
-        images |= {name: None if depth is None else _depth_to_units(depth) for name, depth in depths.items()}
-        tensors |= {
-            f"anchor.{i}.{name}": torch.from_numpy(np.ascontiguousarray(image))
-            for name, image in images.items()
-            if image is not None
-        }
+        images |= {"depth": _depth_to_units(a.depth_m), "depth_sigma": _depth_to_units(a.depth_sigma_m)}
+        for name, image in images.items():
+            if image is not None:
+                tensors[f"anchor.{i}.{name}"] = torch.from_numpy(np.ascontiguousarray(image))
         k = a.intrinsics
         about = {"stamp_ns": a.stamp_ns, "seq": a.seq, "camera_id": a.camera_id}
         about |= {"intrinsics": [k.fx, k.fy, k.cx, k.cy, k.width, k.height]}
-        described.append(about | {"T_world_camera": a.T_world_camera.tolist()})
+        about |= {"T_world_camera": a.T_world_camera.tolist()}
+        described.append(about)
     return tensors, json.dumps(described)
 
 
@@ -309,16 +291,17 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
     for i, d in enumerate(described):
         pose = np.array(d["T_world_camera"], np.float64)
         check_pose(pose, f"anchor {i}")
-        depth, label, sigma = (tensors.get(f"anchor.{i}.{name}") for name in ("depth", "label", "depth_sigma"))
+        found = (tensors.get(f"anchor.{i}.{name}") for name in ("depth", "label", "depth_sigma"))
+        depth, label, sigma = (None if tensor is None else tensor.numpy() for tensor in found)
         anchors.append(
             PosedFrame(
                 stamp_ns=int(d["stamp_ns"]),
                 seq=int(d["seq"]),
                 camera_id=str(d["camera_id"]),
                 rgb=tensors[f"anchor.{i}.rgb"].numpy(),
-                depth_m=None if depth is None else _depth_from_units(depth.numpy()),
-                depth_sigma_m=None if sigma is None else _depth_from_units(sigma.numpy()),
-                label=None if label is None else label.numpy(),
+                depth_m=_depth_from_units(depth),
+                depth_sigma_m=_depth_from_units(sigma),
+                label=label,
                 intrinsics=CameraIntrinsics(*d["intrinsics"]),
                 T_world_camera=pose,
             )
@@ -326,15 +309,6 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
     return tuple(anchors)
 
 
-def pack_label_set(label_set: LabelSet) -> str:
-    """Classes as they stand in the metadata of a weights file."""
-    return msgspec.json.encode(label_set).decode()
-
-
 def unpack_label_set(packed: str) -> LabelSet:
-    """What ``pack_label_set`` gave.
-    Raises LabelError: it is something else."""
-    try:
-        return msgspec.json.decode(packed, type=LabelSet)
-    except msgspec.MsgspecError as error:
-        raise LabelError(f"no label set: {error}") from error
+    """Classes as they stand in the metadata. Raises MsgspecError, LabelError: there is something else."""
+    return msgspec.json.decode(packed, type=LabelSet)

@@ -1,14 +1,12 @@
 """NeSF on saved maps: a 3D network that has seen many maps corrects the class probabilities of this one.
 
 It also says how to get from each point to the centre of the object there, by which a map's instances are separated. The
-map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes
-there say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the
-cell is added, and how much a voxel's own still count. All of it comes from a layer that starts at zero, so that an
-untrained network leaves the map as it is.
+map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes there
+say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the cell
+is added, and how much a voxel's own still count; an untrained network leaves the map as it is.
 
-Its convolutions are *submanifold* ones over the occupied cells (Graham et al. 2018), in plain torch: neighbour tables,
-gathers, matrix products. They give an output where there is an input and nowhere else, so that a surface stays a
-surface however many layers follow. Missing neighbours count as zeros.
+Its convolutions are *submanifold* ones over the occupied cells (Graham et al. 2018), in plain torch: they give an
+output where there is an input and nowhere else, so that a surface stays a surface. Missing neighbours count as zeros.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -162,13 +160,22 @@ def _chunks(x: torch.Tensor, table: torch.Tensor) -> Iterator[tuple[slice, torch
         yield slice(start, start + len(part)), padded.index_select(0, part.reshape(-1)).view(len(part), -1)
 
 
-class SubmanifoldConv(nn.Module):
-    """3^3 convolution over occupied cells; weight (27, in, out) in the order of ``OFFSETS``."""
+class _Convolution(nn.Module):
+    """Weight (places, in, out) and bias (out,)."""
+
+    places: ClassVar[int]
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(_initial(27, channels_in, channels_out))
+        spread = (2 / (self.places * channels_in)) ** 0.5
+        self.weight = nn.Parameter(torch.randn(self.places, channels_in, channels_out) * spread)
         self.bias = nn.Parameter(torch.zeros(channels_out))
+
+
+class SubmanifoldConv(_Convolution):
+    """3^3 convolution over occupied cells; places in the order of ``OFFSETS``."""
+
+    places = 27
 
     def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
         """Features (N, in) of the level's cells -> (N, out)."""
@@ -176,13 +183,10 @@ class SubmanifoldConv(nn.Module):
         return convolved + self.bias
 
 
-class Down(nn.Module):
-    """2^3 convolution of stride 2: each coarser cell sees the cells in it; weight (8, in, out)."""
+class Down(_Convolution):
+    """2^3 convolution of stride 2: each coarser cell sees the cells in it."""
 
-    def __init__(self, channels_in: int, channels_out: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(_initial(8, channels_in, channels_out))
-        self.bias = nn.Parameter(torch.zeros(channels_out))
+    places = 8
 
     def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
         """Features (N, in) of the level's cells -> (P, out) of the next coarser level's."""
@@ -194,23 +198,20 @@ class Down(nn.Module):
         return coarse + self.bias
 
 
-class Up(nn.Module):
-    """Transposed 2^3 convolution back to the cells that are occupied; weight (8, in, out)."""
+class Up(_Convolution):
+    """Transposed 2^3 convolution back to the cells that are occupied."""
+
+    places = 8
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(_initial(8, channels_in, channels_out) * 8**0.5)  # each cell has one parent
-        self.bias = nn.Parameter(torch.zeros(channels_out))
+        super().__init__(channels_in, channels_out)
+        self.weight.data *= 8**0.5  # each cell has one parent
 
     def forward(self, x: torch.Tensor, level: CellLevel) -> torch.Tensor:
         """Features (P, in) of the next coarser level -> (N, out) of the level's cells."""
         count, wide = len(x), self.weight.shape[2]
         spread = x @ self.weight.permute(1, 0, 2).reshape(x.shape[1], 8 * wide)  # (P, 8 * out)
         return spread.view(count * 8, wide).index_select(0, level.parent * 8 + level.corner) + self.bias
-
-
-def _initial(places: int, channels_in: int, channels_out: int) -> torch.Tensor:
-    return torch.randn(places, channels_in, channels_out) * (2 / (places * channels_in)) ** 0.5
 
 
 class SurfacePoints(NamedTuple):
@@ -229,20 +230,17 @@ class SurfacePoints(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Pooled surface: cells (M, 3) int64 in lexicographic order, and their channels (M, C) float32."""
+    """Pooled surface."""
 
-    cells: NDArray[np.int64]
-    x: torch.Tensor
+    cells: NDArray[np.int64]  # (M, 3) in lexicographic order
+    x: torch.Tensor  # (M, C) float32 channels
 
 
 class Near(NamedTuple):
-    """Where points lie among M cells: rows (N, 8) of those round each, M = none, and their weights (N, 8).
+    """Where N points lie among M cells."""
 
-    Weights of a point sum to 1, or to 0 where there is no cell.
-    """
-
-    rows: torch.Tensor
-    weights: torch.Tensor
+    rows: torch.Tensor  # (N, 8) of the cells round each, M = none
+    weights: torch.Tensor  # (N, 8), whose sum is 1, or 0 where there is no cell
 
 
 def pool(points: SurfacePoints) -> Cells:
@@ -313,11 +311,10 @@ class Block(nn.Module):
 
 
 class MapUNet(nn.Module):
-    """A 3D U-Net over the occupied cells of a map, of four levels that all have residual blocks.
+    """A 3D U-Net over the occupied cells of a map, of four levels that all have residual blocks; it sees 1.9 m far.
 
-    Against the paper's U-Net it is narrow at the finest level, where nearly all cells are, and one level deeper: it
-    sees 1.9 m far at half the cost. Each block normalises the features of a cell on their own, so that what surrounds a
-    tile does not matter. Its last layer starts at zero.
+    Each block normalises the features of a cell on their own, so that what surrounds a tile does not matter. Its last
+    layer starts at zero.
     """
 
     def __init__(self, channels_in: int, channels_out: int, width: int = 16) -> None:
@@ -416,7 +413,7 @@ def smoothed_votes(label_set: LabelSet) -> NesfWeights:
     """Used where no weights fit, and the baseline that weights have to beat: votes smoothed, nothing learned."""
     model = Nesf(label_set, NesfConfig(width=1, centres=False)).eval()
     model.start_smoothed()
-    return NesfWeights(model, {}, SMOOTHED)
+    return NesfWeights(model, digest=SMOOTHED)
 
 
 def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
@@ -449,7 +446,7 @@ def load_nesf(path: Path) -> NesfWeights:
     if metadata.get("field") != MAP_KIND:
         raise WeightsError(
             f"{path}: weights of kind '{metadata.get('field')}', which label frames (`replay --weights`); to refine "
-            f"maps takes weights of kind '{MAP_KIND}', from `semantic-mapper-research train --kind {MAP_KIND}`"
+            f"maps takes weights of kind '{MAP_KIND}'"
         )
     with refusing_damage(path):
         config = convert_config(json.loads(metadata["model_config"]), NesfConfig, str(path))

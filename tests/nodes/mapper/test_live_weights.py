@@ -151,9 +151,9 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
         pickle = b"\x80\x04\x95\x10\x00\x00\x00\x00\x00\x00\x00\x8c\x05posix\x8c\x06system\x93."
         for version, (checkpoint, data, parent, says) in enumerate(
             (
-                (good, pickle, "", "not readable as weights"),
-                (good, checkpoint_bytes(good)[:-50], "", "not readable as weights"),
-                (other_set, b"", "", "label set 'nyu40'"),
+                (good, pickle, "", "not a readable safetensors"),
+                (good, checkpoint_bytes(good)[:-50], "", "not a readable safetensors"),
+                (other_set, b"", "", "label set"),
                 (Checkpoint(wide.eval(), (), {}), b"", "", "another network"),
                 (encoder, b"", "", "image encoder is another one"),
                 (broken, b"", "", "NaN"),
