@@ -54,7 +54,7 @@ def export(
 ) -> None:
     """Write a saved map, or a log, in a format of other programs.
 
-    Maps: .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
+    Maps: .ply points (with --format ply-mesh a mesh), .obj mesh, .glb mesh for viewers, .npz arrays for
     numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
     floor was seen. With --costs the costs 0 to 100 of its cells are written next to it (mode raw, unknown 255).
 

@@ -179,16 +179,16 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     if not len(mesh.faces):
         raise MapError("the map has no surface to mesh, or none that is measured so often and so sure")
     color = request.color or "rgb"
-    mesh, files, found = colored(mesh, labels, color), (path,), ()
+    mesh, found = colored(mesh, labels, color), ()
     if request.format == "ply-mesh":
         write_ply(path, mesh, labels, scale_known=scale_known)
     elif request.format == "obj":
-        files = write_obj(path, mesh, labels, class_materials=color == "class", scale_known=scale_known)
+        write_obj(path, mesh, scale_known=scale_known)
     else:
         up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), labels)
         write_glb(path, mesh, labels, up, scale_known=scale_known)
         found = _found_up(request, up)
-    return ExportReport(files, f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
+    return ExportReport((path,), f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
 
 
 def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:

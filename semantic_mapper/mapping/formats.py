@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import struct
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -102,41 +101,15 @@ def _escaped(name: str) -> str:
     return escaped
 
 
-def write_obj(
-    path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
-) -> tuple[Path, Path]:
-    """Write ``path`` and, next to it, the material library of the same stem (.mtl); returns both.
+def write_obj(path: Path, mesh: MapMesh, *, scale_known: bool = True) -> None:
+    """Write vertices to the micrometre, each with its colour behind it (``v x y z r g b``), and faces.
 
-    OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
-    colour behind its position (``v x y z r g b``), as most programs read it. A face is of the class that most of its
-    corners are of; material ``ID_NAME`` stands for a class, ``ID_unknown`` for none. Materials have the colours of
-    their classes with ``class_materials``; else they are white, for programs which multiply both."""
-    library = path.with_suffix(".mtl")
-    names = {i: _material(i, name) for i, name in zip(label_set.ids, label_set.names, strict=True)}
-    names[label_set.ignore_id] = _material(label_set.ignore_id, "unknown")
-    a, b, c = mesh.label[mesh.faces].T
-    label = np.where(b == c, b, a).astype(np.uint8)  # the first one where all three differ
-    used = np.unique(label)
-    with atomic_write(library, raises=MapError) as file:
-        for class_id in used.tolist():
-            color = label_set.colorize(np.array(class_id, np.uint8)) / 255 if class_materials else np.ones(3)
-            values = " ".join(f"{c:.6f}" for c in color)
-            file.write(f"newmtl {names[class_id]}\nKd {values}\nKa 0 0 0\nKs 0 0 0\nillum 1\n\n".encode())
+    OBJ knows neither units nor an up axis: vertices are in the world frame, metres."""
     rows = np.concatenate((mesh.vertices.astype(np.float64), mesh.rgb / 255), axis=1).tolist()
     with atomic_write(path, raises=MapError) as file:
         file.write(b"" if scale_known else b"# scale: unknown\n")
-        file.write(f"mtllib {library.name}\n".encode())
         file.writelines(b"v %.6f %.6f %.6f %.4f %.4f %.4f\n" % tuple(row) for row in rows)
-        for class_id in used.tolist():
-            file.write(f"g {names[class_id]}\nusemtl {names[class_id]}\n".encode())
-            corners = (mesh.faces[label == class_id].astype(np.int64) + 1).tolist()  # OBJ counts from 1
-            file.writelines(b"f %d %d %d\n" % tuple(face) for face in corners)
-    return path, library
-
-
-def _material(class_id: int, name: str) -> str:
-    """Names of materials end at white space, and programs differ in which letters they know."""
-    return f"{class_id}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
+        file.writelines(b"f %d %d %d\n" % tuple(face) for face in (mesh.faces.astype(np.int64) + 1).tolist())
 
 
 _UINT8, _UINT16, _UINT32, _FLOAT = 5121, 5123, 5125, 5126

@@ -90,31 +90,8 @@ def test_glb_holds_every_value_and_what_labels_mean_and_open3d_reads_it_with_y_u
     np.testing.assert_allclose(corners, np.stack((x, z, -y), axis=1), atol=1e-6)  # no mirror
 
 
-@pytest.mark.parametrize("class_materials", [True, False])
-def test_obj_groups_faces_by_class_with_a_material_each(tmp_path: Path, class_materials: bool) -> None:
-    files = write_obj(tmp_path / "map.obj", MESH, LABELS, class_materials=class_materials)
-    assert files == (tmp_path / "map.obj", tmp_path / "map.mtl")
-    rows = [line.split() for line in files[0].read_text().splitlines()]
-    assert rows[0] == ["mtllib", "map.mtl"]
-    vertices = np.array([row[1:] for row in rows if row[0] == "v"], np.float64)
-    np.testing.assert_allclose(vertices[:, :3], MESH.vertices, atol=1e-6)
-    np.testing.assert_array_equal(np.rint(vertices[:, 3:] * 255), MESH.rgb)
-    groups: dict[str, list[list[int]]] = {}
-    for row in rows:
-        if row[0] == "usemtl":
-            group = groups.setdefault(row[1], [])
-        elif row[0] == "f":
-            group.append([int(n) - 1 for n in row[1:]])
-    # Face 0 has corners 5 9 9, face 1 has 5 9 0 (the first counts), face 2 has 9 9 0.
-    assert groups == {"5_table": [[0, 1, 3]], "9_cup": [[0, 2, 1], [1, 2, 3]]}
-    materials = dict(part.split("\n", 1) for part in files[1].read_text().split("newmtl ")[1:])
-    assert materials.keys() == groups.keys()
-    kd = [float(n) for n in materials["9_cup"].splitlines()[0].split()[1:]]
-    np.testing.assert_allclose(kd, np.array(LABELS.colors[1]) / 255 if class_materials else 1, atol=1e-6)
-
-
 def test_open3d_reads_obj_and_ply_mesh_alike(tmp_path: Path) -> None:
-    write_obj(tmp_path / "map.obj", MESH, LABELS, class_materials=True)
+    write_obj(tmp_path / "map.obj", MESH)
     write_ply(tmp_path / "map.ply", MESH, LABELS)
     o3d = load_open3d()
     for name in ("map.obj", "map.ply"):
@@ -122,6 +99,7 @@ def test_open3d_reads_obj_and_ply_mesh_alike(tmp_path: Path) -> None:
         corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
         order, expected = (np.lexsort(c.reshape(-1, 9).T) for c in (corners, MESH.vertices[MESH.faces]))
         np.testing.assert_allclose(corners[order], MESH.vertices[MESH.faces][expected], atol=1e-6)
+        assert sorted(np.rint(np.asarray(mesh.vertex_colors) * 255).tolist()) == sorted(MESH.rgb.tolist())
     vertices = o3d.t.io.read_point_cloud(str(tmp_path / "map.ply")).point  # the mesh reader drops what it knows not
     assert (vertices["label"].numpy().ravel() == MESH.label).all()
     assert (vertices["colors"].numpy() == MESH.rgb).all()
