@@ -101,7 +101,7 @@ class MapClient(Closing):
         With ``gone``, behind them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest
         64.
         """
-        return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone)).things()
+        return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone))
 
     def graph(self, up: ArrayLike | None = None) -> SceneGraph:
         """Floors, rooms, doors and things; see ``queries.graph.GraphTracker``.

@@ -290,7 +290,7 @@ class QueryService(Closing):
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
 
-    def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> questions.InstanceArrays:
+    def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> tuple[Instance, ...]:
         # Out of there while it updates: one that fails half way is not used again.
         tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
         tracker = tracker or InstanceTracker(up=request.up)
@@ -299,7 +299,7 @@ class QueryService(Closing):
         self._tracked[request.up] = tracker, snapshot.version, things
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        return questions.InstanceArrays.of((*things, *(tracker.gone if request.gone else ())), snapshot.label_set)
+        return (*things, *(tracker.gone if request.gone else ()))
 
 
 def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:

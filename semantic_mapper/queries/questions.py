@@ -12,9 +12,8 @@ a ``CodecError``.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -26,7 +25,7 @@ from semantic_mapper.errors import CodecError, SemanticMapperError, TransportErr
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
-from semantic_mapper.queries.instances import Instance, OrientedBox
+from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.surface import RayHits
@@ -46,6 +45,7 @@ from semantic_mapper.transport.messages import (
 from semantic_mapper.types import Float64, Int64, UInt8
 
 MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
+MAX_ANSWER_HEADER_BYTES = 1 << 22  # some 10,000 things
 MAX_WAIT_S = 3600.0  # for an answer, of a client that does not say
 
 AnswerT = TypeVar("AnswerT")
@@ -151,71 +151,6 @@ class Weights:
     versions: tuple[WeightsEntry, ...]  # all that it knows of, the oldest first
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InstanceArrays:
-    """N things as they travel: row n of each array is thing n, and ``voxels`` has those of all in order."""
-
-    label_set: LabelSet  # of the map
-    # id, class_id, confidence, centroid, measured: (N,) and (N, 3), as of ``Instance``.
-    id: Int64
-    class_id: Int64
-    confidence: Float64
-    centroid: Float64
-    # center, size, R_world_box: (N, 3), (N, 3) and (N, 3, 3), as of ``OrientedBox``.
-    center: Float64
-    size: Float64
-    R_world_box: Float64
-    measured: Float64
-    gone_ns: Int64  # (N,) stamp of the frame at which most of it was gone; -1 = it is there
-    voxel_count: Int64  # (N,) of each thing
-    voxels: NDArray[np.int32]  # (M, 3) int32
-
-    @classmethod
-    def of(cls, things: Sequence[Instance], labels: LabelSet) -> Self:
-        """Things of a map with these classes."""
-
-        def column(values: Iterable[Any], *shape: int, dtype: type = np.float64) -> NDArray[Any]:
-            return np.array([*values], dtype).reshape(len(things), *shape)
-
-        return cls(
-            labels,
-            column((t.id for t in things), dtype=np.int64),
-            column((t.class_id for t in things), dtype=np.int64),
-            column(t.confidence for t in things),
-            column((t.centroid for t in things), 3),
-            column((t.box.center for t in things), 3),
-            column((t.box.size for t in things), 3),
-            column((t.box.R_world_box for t in things), 3, 3),
-            column(t.measured for t in things),
-            column((-1 if t.gone_ns is None else t.gone_ns for t in things), dtype=np.int64),
-            column((len(t.voxels) for t in things), dtype=np.int64),
-            np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
-        )
-
-    def things(self) -> tuple[Instance, ...]:
-        """The things again.
-
-        Raises CodecError: arrays that do not go together, or a class that the map does not have.
-        """
-        columns = (self.id, self.class_id, self.confidence, self.measured, self.gone_ns, self.voxel_count)
-        arrays = (self.centroid, self.center, self.size, self.R_world_box)
-        fits = len({len(column) for column in (*columns, *arrays)}) == 1 and (self.voxel_count >= 0).all()
-        if not fits or self.voxel_count.sum() != len(self.voxels):
-            raise CodecError("instances: arrays of the answer do not go together")
-        names = dict(zip(self.label_set.ids, self.label_set.names, strict=True))
-        if not np.isin(self.class_id, self.label_set.ids).all():
-            raise CodecError(f"instances: of a class that label set '{self.label_set.name}' does not have")
-        parts = np.split(self.voxels, np.cumsum(self.voxel_count)[:-1]) if len(self.id) else ()
-        return tuple(
-            Instance(
-                id_, kind, names[kind], sure, centroid, OrientedBox(*box), voxels, measured, gone if gone >= 0 else None
-            )
-            for id_, kind, sure, measured, gone, centroid, *box, voxels in zip(
-                *(column.tolist() for column in columns[:5]), *arrays, parts, strict=True
-            )
-        )
-
-
 class InfoRequest(Request[MapInfo], frozen=True, kw_only=True):
     """What the map is."""
 
@@ -251,7 +186,7 @@ class BoxRequest(Request[MapPoints], frozen=True, kw_only=True):
     upper: Point
 
 
-class InstancesRequest(Request[InstanceArrays], frozen=True, kw_only=True):
+class InstancesRequest(Request[tuple[Instance, ...]], frozen=True, kw_only=True):
     """Countable things; ``gone``: also those that have gone lately."""
 
     takes_long: ClassVar[bool] = True
@@ -332,7 +267,7 @@ QUESTIONS = {
     "nearest": Question(NearestRequest, NearestSurface | None),
     "cast_rays": Question(RaysRequest, RayHits),
     "points_in_box": Question(BoxRequest, MapPoints),
-    "instances": Question(InstancesRequest, InstanceArrays),
+    "instances": Question(InstancesRequest, tuple[Instance, ...]),
     "occupancy": Question(OccupancyRequest, UInt8),
     "distance_field": Question(DistanceRequest, DistanceField),
     "changes": Question(ChangesRequest, BlockChanges),
@@ -387,7 +322,7 @@ def decode_answer(name: str, kind: type[AnswerT], parts: Parts) -> tuple[MapStat
     """
     what = f"answer to '{name}'"
     actual = read_name(parts)
-    header = unpack_header(parts[1], what)
+    header = unpack_header(parts[1], what, MAX_ANSWER_HEADER_BYTES)
     if actual == _ERROR:
         reported = check_header(header, _ErrorHeader, what)
         raise _RAISED.get(reported.error, TransportError)(reported.text)
@@ -428,7 +363,9 @@ def _encode(name: str, about: dict[str, Any], message: object, what: str) -> lis
         raise CodecError(f"{what}: cannot be sent: {error}") from error
     if size > MAX_PART_BYTES:
         raise CodecError(f"{what}: arrays of {size} bytes, at most {MAX_PART_BYTES} can be sent; ask for less")
-    header = pack_header({**about, "answer": plain} if about else plain, what)
+    header = (
+        pack_header({**about, "answer": plain}, what, MAX_ANSWER_HEADER_BYTES) if about else pack_header(plain, what)
+    )
     return [name.encode(), header, *([b"".join(buffers)] if buffers else [])]
 
 

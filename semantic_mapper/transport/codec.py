@@ -221,19 +221,19 @@ def to_plain(value: object, what: str) -> Any:
         raise CodecError(f"{what}: cannot be sent: {error}") from error
 
 
-def pack_header(header: Mapping[str, Any], what: str) -> bytes:
-    """Plain fields, which have passed ``check_header``, -> msgpack; ``CodecError`` beyond ``MAX_HEADER_BYTES``."""
+def pack_header(header: Mapping[str, Any], what: str, limit: int = MAX_HEADER_BYTES) -> bytes:
+    """Plain fields, which have passed ``check_header``, -> msgpack; ``CodecError`` beyond ``limit`` bytes."""
     packed = msgspec.msgpack.encode({"v": PROTOCOL_VERSION, **header})
-    if len(packed) > MAX_HEADER_BYTES:
-        raise CodecError(f"{what}: cannot be sent: a header of {len(packed)} bytes, at most {MAX_HEADER_BYTES}")
+    if len(packed) > limit:
+        raise CodecError(f"{what}: cannot be sent: a header of {len(packed)} bytes, at most {limit}")
     return packed
 
 
-def unpack_header(packed: Buffer, what: str) -> dict[str, Any]:
+def unpack_header(packed: Buffer, what: str, limit: int = MAX_HEADER_BYTES) -> dict[str, Any]:
     """msgpack -> plain fields without the protocol's version, not checked any further. Raises CodecError: too long, not
     msgpack, nested too deeply, no map, or of another protocol version."""
-    if len(packed) > MAX_HEADER_BYTES:
-        raise CodecError(f"{what}: header of {len(packed)} bytes, at most {MAX_HEADER_BYTES} are accepted")
+    if len(packed) > limit:
+        raise CodecError(f"{what}: header of {len(packed)} bytes, at most {limit} are accepted")
     try:
         fields = msgspec.msgpack.decode(packed, type=dict[str, Any])
     except (ValueError, RecursionError) as error:  # ValueError includes bad UTF-8

@@ -13,7 +13,7 @@ from semantic_mapper.mapping.map_types import CameraPose, MapPoints
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.questions import Correction, InstanceArrays, MapInfo, MapState, Weights, WeightsEntry
+from semantic_mapper.queries.questions import Correction, MapInfo, MapState, Weights, WeightsEntry
 from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.messages import (
     EndOfStream,
@@ -177,7 +177,7 @@ def answers() -> dict[str, Any]:
         "nearest": NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75),
         "cast_rays": RayHits(far, u8, f4, rgb, measured),
         "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
-        "instances": InstanceArrays.of([thing], LABELS),
+        "instances": (thing,),
         "occupancy": u8 % 3,
         "pose": CameraPose("rooms", 7, np.eye(4)),
         "distance_field": DistanceField(np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3),

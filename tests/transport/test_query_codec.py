@@ -9,11 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semantic_mapper.errors import CodecError
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.queries.nearest import PointAnswers
 from semantic_mapper.queries.questions import (
     AtRequest,
-    InstanceArrays,
     MapState,
     decode_answer,
     decode_question,
@@ -77,9 +75,6 @@ def test_what_is_no_answer_is_refused() -> None:
             decode_answer("occupancy", UInt8, bad)
     with pytest.raises(CodecError, match="got one to 'occupancy'"):
         decode_answer("at", PointAnswers, parts)
-    nothing = InstanceArrays.of((), ROOMS)
-    with pytest.raises(CodecError, match="do not go together"):
-        InstanceArrays(ROOMS, np.ones(1, np.int64), *(getattr(nothing, n) for n in nothing.__slots__[2:])).things()
 
 
 @given(st.data())
