@@ -27,8 +27,7 @@ def check_points(points: ArrayLike, snapshot: MapSnapshot, name: str = "points")
     """Points (N, 3) in metres, no farther than a map can reach -> units of voxels."""
     require_metres(snapshot.scale_known, name)
     array = np.ascontiguousarray(as_numbers(points, name))
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise MapError(f"{name}: expected shape (N, 3), got {array.shape}")
+    _expect(array, 2, name)
     reach_m = 4 * KEY_LIMIT * snapshot.voxel_size_m  # half of what keys can address
     near = (np.abs(array) < reach_m).all(axis=1)
     if not near.all():
@@ -40,17 +39,15 @@ def check_points(points: ArrayLike, snapshot: MapSnapshot, name: str = "points")
 def check_point(point: ArrayLike, snapshot: MapSnapshot, name: str = "point") -> Float64:
     """One point (3,) in metres -> units of voxels."""
     array = as_numbers(point, name)
-    if array.shape != (3,):
-        raise MapError(f"{name}: expected shape (3,), got {array.shape}")
+    _expect(array, 1, name)
     return check_points(array[None], snapshot, name)[0]
 
 
-def check_direction(direction: ArrayLike, name: str) -> Float64:
-    """A direction (3,) or directions (N, 3) of finite length above 0 -> of unit length."""
-    array = as_numbers(direction, name)
-    if array.ndim not in (1, 2) or array.shape[-1] != 3:
-        raise MapError(f"{name}: expected shape (3,) or (N, 3), got {array.shape}")
-    length = np.linalg.norm(array, axis=-1, keepdims=True)
+def check_directions(directions: ArrayLike, name: str) -> Float64:
+    """Directions (N, 3), or one (3,), of finite length above 0 -> (N, 3) of unit length."""
+    array = np.atleast_2d(as_numbers(directions, name))
+    _expect(array, 2, name)
+    length = np.linalg.norm(array, axis=1, keepdims=True)
     if not (np.isfinite(length) & (length > 0)).all():
         raise MapError(f"{name}: a direction must have a finite length above 0")
     return array / length
@@ -58,30 +55,29 @@ def check_direction(direction: ArrayLike, name: str) -> Float64:
 
 def check_up(up: ArrayLike) -> Float64:
     """One direction (3,) -> of unit length."""
-    unit = check_direction(up, "up")
-    if unit.shape != (3,):
-        raise MapError(f"up: expected shape (3,), got {unit.shape}")
-    return unit
+    array = as_numbers(up, "up")
+    _expect(array, 1, "up")
+    return check_directions(array, "up")[0]
 
 
 def check_box(lower: ArrayLike, upper: ArrayLike, snapshot: MapSnapshot) -> tuple[Float64, Float64]:
     """Corners (3,) of a box with volume in metres -> units of voxels."""
     low, high = check_point(lower, snapshot, "lower"), check_point(upper, snapshot, "upper")
     if not (low < high).all():
-        raise MapError(
-            f"the box from {np.asarray(lower).tolist()} to {np.asarray(upper).tolist()} m is empty; "
-            "each coordinate of lower must be below that of upper"
-        )
+        raise MapError(f"the box from {lower} to {upper} m is empty; lower must be below upper along each axis")
     return low, high
 
 
-def check_positive(value: float, name: str, most: float = np.inf) -> float:
-    """A finite number above 0, and at most so large."""
-    if not (np.isfinite(value) and value > 0):
-        raise MapError(f"{name} must be a finite number above 0, got {value}")
-    if value > most:
-        raise MapError(f"{name} must be at most {most:g}, got {value}")
+def check_positive(value: float, name: str, most: float) -> float:
+    """A number above 0, and at most so large."""
+    if not 0 < value <= most:  # NaN, too
+        raise MapError(f"{name} must be above 0, at most {most:g}, got {value}")
     return float(value)
+
+
+def _expect(array: Float64, dimensions: int, name: str) -> None:
+    if array.ndim != dimensions or array.shape[-1] != 3:
+        raise MapError(f"{name}: expected shape {'(3,)' if dimensions == 1 else '(N, 3)'}, got {array.shape}")
 
 
 def rows_in_box(snapshot: MapSnapshot, low: Float64, high: Float64) -> NDArray[np.int64]:

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.blocks import BlockIndex
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.checks import (
     as_numbers,
     check_box,
-    check_direction,
+    check_directions,
     check_points,
     check_positive,
     rows_in_box,
@@ -28,6 +28,7 @@ from semantic_mapper.queries.checks import (
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
 
+READ_AT_ONCE = 1024  # blocks, for which there is room for the surface of each voxel
 MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
 
@@ -42,13 +43,16 @@ class SurfaceVoxels(NamedTuple):
 def surface_voxels(snapshot: MapSnapshot, rows: NDArray[np.int64] | None = None) -> SurfaceVoxels:
     """Surface voxels of some blocks (ascending positions in ``packed``), by default of all."""
     rows = np.arange(snapshot.block_count) if rows is None else rows
-    keys, slots = snapshot.keys[rows], snapshot.slots[rows]
-    counts = np.empty(len(rows), np.int64)
-    count_surface_voxels(keys, slots, snapshot.index, snapshot.voxels, counts)
-    total = int(counts.sum())
-    voxel, point = np.empty(total, np.int32), np.empty((total, 3), np.float64)
-    collect_surface_voxels(keys, slots, counts, snapshot.index, snapshot.voxels, voxel, point)
-    return SurfaceVoxels(np.repeat(rows, counts).astype(np.int32), voxel, point)
+    keys, slots, counts = snapshot.keys[rows], snapshot.slots[rows], np.empty(len(rows), np.int64)
+    voxels, points = [np.empty(0, np.int32)], [np.empty((0, 3))]
+    voxel, point = np.empty(BLOCK_VOXELS * READ_AT_ONCE, np.int32), np.empty((BLOCK_VOXELS * READ_AT_ONCE, 3))
+    for start in range(0, len(rows), READ_AT_ONCE):
+        part = slice(start, start + READ_AT_ONCE)
+        blocks = keys[part], slots[part], snapshot.index, snapshot.voxels
+        count = collect_surface_voxels(*blocks, counts[part], voxel, point)
+        voxels.append(voxel[:count].copy())
+        points.append(point[:count].copy())
+    return SurfaceVoxels(np.repeat(rows, counts).astype(np.int32), np.concatenate(voxels), np.concatenate(points))
 
 
 def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
@@ -72,16 +76,11 @@ def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> 
 
 
 @kernel
-def count_surface_voxels(keys: Int32, slots: Int32, index: BlockIndex, voxels: BlockVoxels, counts: Int64) -> None:
-    """Write the number of surface voxels (B,) of blocks with keys (B, 3)."""
-    ...
-
-
-@kernel
 def collect_surface_voxels(
-    keys: Int32, slots: Int32, counts: Int64, index: BlockIndex, voxels: BlockVoxels, voxel: Int32, point: Float64
-) -> None:
-    """Write ``voxel`` (N,) and ``point`` (N, 3) of ``SurfaceVoxels``, of which each block has ``counts`` (B,)."""
+    keys: Int32, slots: Int32, index: BlockIndex, voxels: BlockVoxels, counts: Int64, voxel: Int32, point: Float64
+) -> int:
+    """Write ``voxel`` (512 B,) and ``point`` (512 B, 3) of ``SurfaceVoxels``, as many as it returns, and how many each
+    block has (B,)."""
     ...
 
 
@@ -107,7 +106,7 @@ def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, 
     """
     check_positive(max_m, "max_m", MAX_RANGE_M)
     origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")
-    direction = np.atleast_2d(check_direction(directions, "directions"))
+    direction = check_directions(directions, "directions")
     if len(origin) != len(direction) and 1 not in (len(origin), len(direction)):
         raise MapError(f"cast_rays: {len(origin)} origins and {len(direction)} directions do not go together")
     count = max(len(origin), len(direction)) if len(origin) and len(direction) else 0

@@ -35,8 +35,8 @@ def test_points(query: Callable[..., Any], points: Any, match: str) -> None:
 
 
 def test_radius_and_point() -> None:
-    for radius, match in ((0.0, "above 0"), (NAN, "above 0"), (0.6, "at most 0.5")):
-        with pytest.raises(MapError, match=match):
+    for radius in (0.0, NAN, 0.6):
+        with pytest.raises(MapError, match=r"above 0, at most 0\.5"):
             nearest.at(whole(), [[0, 0, 0]], radius)
     for point in ((0, 0), [(0, 0, 0)], (0, 0, NAN)):
         with pytest.raises(MapError, match="point"):
@@ -74,5 +74,5 @@ def test_rays() -> None:
     refused("directions: expected shape", (0, 0, 0), (1, 0))
     refused("origins", (0, NAN, 0), (0, 0, 1))
     refused("2 origins and 3 directions", np.zeros((2, 3)), np.ones((3, 3)))
-    refused("max_m must be at most 100", (0, 0, 0), (0, 0, 1), 1e6)
-    refused("max_m must be a finite number above 0", (0, 0, 0), (0, 0, 1), 0.0)
+    for far in (1e6, 0.0, NAN):
+        refused("max_m must be above 0, at most 100", (0, 0, 0), (0, 0, 1), far)
