@@ -33,10 +33,10 @@ from semantic_mapper.config import (
     read_json,
     read_toml,
 )
-from semantic_mapper.drivers.lens import lens_intrinsics, rectify_maps
+from semantic_mapper.drivers.lens import ideal_fisheye_view, lens_intrinsics
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import read_regular, write_bytes
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import camera_matrix, check_pose
 from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
 
 PlaneT = TypeVar("PlaneT", Float32, UInt8)
@@ -44,9 +44,7 @@ Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]  # a pose, row by row
 _YAML = (".yaml", ".yml")
 GUESSED_VIEW_DEG = 60.0  # horizontal, of a camera that nobody has calibrated
-
-
-WANTED = (
+_WANTED = (
     "a calibration has fx fy cx cy width height and distortion (TOML); of YAML, ROS's camera_info (image_width, "
     "image_height, camera_matrix, distortion_model, distortion_coefficients) and Kalibr's (cam0: camera_model, "
     "intrinsics, distortion_model, distortion_coeffs, resolution) are read"
@@ -101,7 +99,7 @@ def load_calibration(path: Path) -> CameraIntrinsics:
     """
     file = None if path.suffix.lower() in _YAML else _load_file(path)
     try:
-        k = _load_yaml(path) if file is None else _intrinsics(file)
+        k = _load_yaml(path) if file is None else _intrinsics(file, "fisheye" if file.fisheye else "opencv")
         if not (0 < k.cx < k.width and 0 < k.cy < k.height):
             raise ConfigError(f"the principal point ({k.cx:g}, {k.cy:g}) is outside of the {k.width}x{k.height} image")
         return k
@@ -109,7 +107,7 @@ def load_calibration(path: Path) -> CameraIntrinsics:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (FrameError, YAMLError, ValueError, RecursionError) as error:  # ValueError: ConfigError, UTF-8, msgspec
         reason = " ".join(str(error).split())[:300]
-        raise ConfigError(f"{path}: {reason}" + (f"; {WANTED}" if file is None else "")) from error
+        raise ConfigError(f"{path}: {reason}" + (f"; {_WANTED}" if file is None else "")) from error
 
 
 def load_mount(path: Path) -> Float64 | None:
@@ -133,11 +131,7 @@ def save_calibration(
 ) -> None:
     """Write a calibration file, TOML, that reads back to the same numbers; ``ConfigError`` where it cannot be written.
 
-    Args:
-        path: Replaced if it is there.
-        measured: With distortion.
-        T_rig_camera: (4, 4) where the camera is on a rig.
-        about: When, how, how well: for people.
+    ``T_rig_camera`` (4, 4) where the camera is on a rig; ``about``: when, how, how well, for people.
     """
     lens = _lens_table(measured)
     if isinstance(measured, FisheyeIntrinsics):
@@ -154,13 +148,9 @@ def load_stereo(path: Path) -> StereoCalibration:
     """
     try:
         file = load_config(path, StereoFile)
-        left, right = (
-            CameraIntrinsics(k.fx, k.fy, k.cx, k.cy, k.width, k.height, k.distortion) for k in (file.left, file.right)
-        )
-    except FrameError as error:
-        raise ConfigError(f"{path}: {error}") from error
-    except ConfigError as error:
-        raise ConfigError(f"{error}; `semantic-mapper calibrate --stereo` makes the file of a pair") from error
+        left, right = _intrinsics(file.left), _intrinsics(file.right)
+    except (FrameError, ConfigError) as error:
+        raise ConfigError(f"{path}: {error}; `semantic-mapper calibrate --stereo` makes the file of a pair") from error
     if (left.width, left.height) != (right.width, right.height):
         raise ConfigError(f"{path}: the left and the right images have different sizes")
     return StereoCalibration(left, right, rigid_matrix(file.T_right_left, f"{path}: T_right_left"), file.swapped)
@@ -193,10 +183,8 @@ def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraInt
     """
     if path and uncalibrated:
         raise CameraError(f"{camera}: has a calibration and is to be used uncalibrated; leave one of the two out")
-    if path:
-        return load_calibration(Path(path))
-    if uncalibrated:
-        return None
+    if path or uncalibrated:
+        return load_calibration(Path(path)) if path else None
     raise CameraError(
         f"{camera}: has no calibration, and without its focal length nothing can be mapped. Ways out: make a file with "
         "`semantic-mapper calibrate`; or write one from the data sheet (fx fy cx cy width height distortion); name "
@@ -218,12 +206,25 @@ class Rectifier:
 
     def __init__(self, measured: CameraIntrinsics) -> None:
         self.intrinsics = measured
-        self._maps: tuple[np.ndarray, np.ndarray] | None = None
-        self._exact: tuple[np.ndarray, np.ndarray] | None = None
-        if measured.distorted:
-            self.intrinsics, *exact = rectify_maps(measured)
-            self._exact = (exact[0], exact[1])
-            self._maps = cv2.convertMaps(*self._exact, cv2.CV_16SC2)
+        self._exact: tuple[Float32, Float32] | None = None  # where its pixels lie in the image of the lens: x and y
+        if not measured.distorted:
+            return
+        K, lens, size = camera_matrix(measured), np.array(measured.distortion), (measured.width, measured.height)
+        undistort_maps = cv2.initUndistortRectifyMap
+        try:
+            if isinstance(measured, FisheyeIntrinsics):
+                undistort_maps, self.intrinsics = cv2.fisheye.initUndistortRectifyMap, ideal_fisheye_view(measured)
+            else:
+                new = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)[0]
+                fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
+                self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
+        except FrameError as error:
+            raise ConfigError(
+                f"the lens distortion {lens.tolist()} leaves no usable image: {error}; calibrate the camera again"
+            ) from error
+        x, y = undistort_maps(K, lens, np.eye(3), camera_matrix(self.intrinsics), size, cv2.CV_32FC1)
+        self._exact = np.asarray(x, np.float32), np.asarray(y, np.float32)
+        self._maps = cv2.convertMaps(*self._exact, cv2.CV_16SC2)
 
     def nearest(self, image: PlaneT) -> PlaneT:
         """Depth or classes (H, W) in the pixels of the lens -> of the rectified image, each from the nearest pixel."""
@@ -234,16 +235,16 @@ class Rectifier:
 
     def __call__(self, bgr: UInt8) -> UInt8:
         """(H, W, 3) BGR as OpenCV captures it -> rectified RGB of the same size."""
-        if self._maps is not None:
+        if self._exact is not None:
             bgr = np.asarray(cv2.remap(bgr, *self._maps, cv2.INTER_LINEAR), np.uint8)
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _intrinsics(file: CalibrationFile) -> CameraIntrinsics:
-    k, size = (file.fx, file.fy, file.cx, file.cy), (file.width, file.height)
-    if not file.fisheye and len(file.distortion) in COEFFICIENTS:
-        return CameraIntrinsics(*k, *size, file.distortion)
-    return lens_intrinsics("fisheye" if file.fisheye else "opencv", file.distortion, k, size)
+def _intrinsics(lens: LensTable, model: str = "opencv") -> CameraIntrinsics:
+    k, size = (lens.fx, lens.fy, lens.cx, lens.cy), (lens.width, lens.height)
+    if model == "opencv" and len(lens.distortion) in COEFFICIENTS:
+        return CameraIntrinsics(*k, *size, lens.distortion)
+    return lens_intrinsics(model, lens.distortion, k, size)
 
 
 def _load_file(path: Path) -> CalibrationFile:

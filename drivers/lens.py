@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
-from semantic_mapper.errors import ConfigError, FrameError
-from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics
 
 # Coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty.
 _PINHOLE = (
@@ -35,16 +33,10 @@ def is_fisheye_model(model: str) -> bool:
 def lens_intrinsics(
     model: str, coefficients: Sequence[float], k: tuple[float, float, float, float], size: tuple[int, int]
 ) -> CameraIntrinsics:
-    """Intrinsics of a camera whose lens has a model by name.
+    """Intrinsics of a camera whose lens has a model by name, with any number of coefficients in OpenCV's order.
 
-    Raises ConfigError: a model that is neither OpenCV's pinhole nor its fisheye, or more coefficients than it has.
-    FrameError: see ``CameraIntrinsics``.
-
-    Args:
-        model: Name of the model, however it is written.
-        coefficients: In OpenCV's order, any number of them.
-        k: fx fy cx cy; pixel centres are integers.
-        size: (width, height).
+    ``k``: fx fy cx cy; pixel centres are integers. Raises ConfigError: a model that is neither OpenCV's pinhole nor its
+    fisheye, or more coefficients than it has. FrameError: see ``CameraIntrinsics``.
     """
     name = _plain(model)
     values = [float(value) for value in coefficients]
@@ -56,9 +48,9 @@ def lens_intrinsics(
         return CameraIntrinsics(*k, *size)
     if name in _PINHOLE and len(values) <= COEFFICIENTS[-1]:
         count = next(count for count in COEFFICIENTS if count >= len(values))
-        return CameraIntrinsics(*k, *size, _padded(values, count))
+        return CameraIntrinsics(*k, *size, (*values, *[0.0] * (count - len(values))))
     if name in _FISHEYE and len(values) <= 4:
-        return FisheyeIntrinsics(*k, *size, _padded(values, 4))
+        return FisheyeIntrinsics(*k, *size, (*values, *[0.0] * (4 - len(values))))
     if name in _PINHOLE or name in _FISHEYE:
         raise ConfigError(f"lens model '{model}' with {len(values)} coefficients; it has fewer: calibrate again")
     raise ConfigError(
@@ -72,7 +64,10 @@ def _plain(model: str) -> str:
 
 
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
-    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees."""
+    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees.
+
+    ``FrameError`` where there is none.
+    """
     distance = _THETAS * (1 + np.polynomial.polynomial.polyval(_THETAS**2, (0.0, *lens.distortion)))
     rising = int(np.argmax(np.diff(distance, append=-1.0) <= 0)) + 1  # beyond its fold a polynomial means nothing
 
@@ -83,39 +78,8 @@ def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
 
     left, right = reach(lens.cx, lens.fx), reach(lens.width - 1 - lens.cx, lens.fx)
     up, down = reach(lens.cy, lens.fy), reach(lens.height - 1 - lens.cy, lens.fy)
-    if left + right <= 0 or up + down <= 0:
-        return _usable(lens, 0.0, 0.0, 0.0, 0.0)
-    focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down))
+    seen = min(left + right, up + down) > 0
+    focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down)) if seen else 0.0
     cx = (lens.width - 1) / 2 + focal * (left - right) / 2
     cy = (lens.height - 1) / 2 + focal * (up - down) / 2
-    return _usable(lens, focal, focal, cx, cy)
-
-
-def _usable(lens: CameraIntrinsics, fx: float, fy: float, cx: float, cy: float) -> CameraIntrinsics:
-    """The ideal camera of a lens."""
-    try:
-        return CameraIntrinsics(fx, fy, cx, cy, lens.width, lens.height)
-    except FrameError as error:
-        raise ConfigError(
-            f"the lens distortion {lens.distortion} leaves no usable image: {error}; calibrate the camera again"
-        ) from error
-
-
-def rectify_maps(measured: CameraIntrinsics) -> tuple[CameraIntrinsics, Float32, Float32]:
-    """The ideal pinhole camera of a lens (``ConfigError`` without one), and where its pixels lie in the image of the
-    lens: (H, W) x and y."""
-    K, lens = camera_matrix(measured), np.array(measured.distortion, np.float64)
-    size = (measured.width, measured.height)
-    if isinstance(measured, FisheyeIntrinsics):
-        ideal = ideal_fisheye_view(measured)
-        x, y = cv2.fisheye.initUndistortRectifyMap(K, lens, np.eye(3), camera_matrix(ideal), size, cv2.CV_32FC1)
-        return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
-    new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
-    fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
-    ideal = _usable(measured, fx, fy, cx, cy)
-    x, y = cv2.initUndistortRectifyMap(K, lens, np.eye(3), new, size, cv2.CV_32FC1)
-    return ideal, np.asarray(x, np.float32), np.asarray(y, np.float32)
-
-
-def _padded(values: Sequence[float], count: int) -> tuple[float, ...]:
-    return (*values, *(0.0 for _ in range(count - len(values))))
+    return CameraIntrinsics(focal, focal, cx, cy, lens.width, lens.height)

@@ -26,7 +26,7 @@ STALL_S = 3.0  # without an image for so long, a device is opened again
 QUEUE = 1  # images that wait for their reader; the oldest gives way, which is a gap
 SLICE_S = 0.1  # how long a device that is polled waits for an image at a time
 FUTURE_NS = 100_000_000  # a stamp further ahead of now is wrong
-MIN_HZ = 1e-3  # of a film or camera: one divided by it is still a time
+MIN_HZ, MAX_HZ = 1e-3, 1e3  # beyond, what a container or device reports is no rate
 DRIFT = 2e-4  # how much faster or slower than ours the sender's clock may run
 LATE_NS = 1_000_000_000  # an image is never so much later than the quickest one: then its clock is not usable
 CLOSE_S = 5.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
@@ -69,10 +69,8 @@ class Device:
 class LiveCamera(Camera):
     """A thread owns the device, since a read may hang for seconds. The newest image wins; a lost device is waited for.
 
-    Args:
-        camera_id: What its images are called.
-        open_device: Opens it, each time again; gets an event that tells it to give up. ``CameraError``: not there.
-        stall_s: Silence after which a stream counts as stalled.
+    ``open_device`` opens it, each time again (``CameraError``: not there), and gets an event that tells it to give up.
+    After ``stall_s`` of silence a stream counts as stalled.
     """
 
     def __init__(
@@ -135,7 +133,6 @@ class LiveCamera(Camera):
                 raise CameraError(f"camera '{self._camera_id}': its reading thread has failed; the log says why")
 
     def _open(self) -> Device:
-        """Raises: CameraError: it is not there."""
         device = self._device = self._open_device(self._stopping)
         self._info = device.info
         self._counter.restart(device.info.frame_hz)
@@ -191,14 +188,8 @@ class LiveCamera(Camera):
 
 
 class CaptureDevice(Device):
-    """A ``Device`` that OpenCV reads, each image rectified.
-
-    Args:
-        camera_id: What its images are called.
-        source: For people: model and address.
-        capture: Open; ``CameraError``: it gives no images, or of another size than was calibrated.
-        measured: Its calibration; None: guessed, said in ``warnings``.
-        metadata: For ``info``.
+    """A ``Device`` that OpenCV reads, each image rectified; ``CameraError``: ``capture`` gives no images, or of another
+    size than was calibrated. ``source``: model and address for people. ``measured`` None: guessed, as ``warnings`` say.
     """
 
     def __init__(
@@ -226,7 +217,8 @@ class CaptureDevice(Device):
                 "a size that it offers"
             )
         self._rectify = Rectifier(measured)
-        hz = nominal_hz(self.get(cv2.CAP_PROP_FPS))
+        hz = self.get(cv2.CAP_PROP_FPS)
+        hz = hz if MIN_HZ <= hz <= MAX_HZ else 0.0
         self.info = StreamInfo(source, {camera_id: self._rectify.intrinsics}, frame_hz=hz, metadata=metadata)
 
     @property
@@ -277,11 +269,6 @@ def first_of(read: Callable[[], FirstT | None], stopping: threading.Event, name:
     raise CameraError(
         f"{name} was opened, but has given no image for {START_S:g} s: plug it in again, or set a lower `fps`"
     )
-
-
-def nominal_hz(reported: float) -> float:
-    """A rate as a container or a device reports it; 0 for what cannot be one."""
-    return reported if MIN_HZ <= reported <= 1000 else 0.0
 
 
 class FrameCounter:

@@ -7,14 +7,13 @@ A package offers ``Config``, a ``msgspec.Struct``; ``open_camera(config, camera_
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from semantic_mapper.config import convert_config
+from semantic_mapper.config import convert_config, nearest
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
@@ -36,9 +35,7 @@ class FoundCamera:
 def load_driver(kind: str) -> Any:
     """The package of a kind; ``ConfigError``: unknown, ``DependencyError``: something is not installed."""
     if kind not in KINDS:
-        near = difflib.get_close_matches(kind, KINDS, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"
-        raise ConfigError(f"no kind of camera is called '{kind}'; {hint}")
+        raise ConfigError(f"no kind of camera is called '{kind}'{nearest(kind, KINDS)}")
     try:
         return importlib.import_module(f"semantic_mapper.drivers.{kind}")
     except ImportError as error:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from typing import Any
 
-from semantic_mapper.config import convert_config
+from semantic_mapper.config import convert_config, nearest
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.calibration import rigid_matrix
 from semantic_mapper.drivers.poses.board import BoardPoseSource
@@ -35,9 +34,7 @@ def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseCon
     """
     kind = config.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
-        near = difflib.get_close_matches(str(kind), KINDS, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise ConfigError(f"{where}: kind must be one of {', '.join(KINDS)}, got {kind!r}{hint}")
+        raise ConfigError(f"{where}: no kind of poses is called {kind!r}{nearest(str(kind), [*KINDS])}")
     checked = convert_config(dict(config), KINDS[kind], where)
     for name in checked.__struct_fields__:
         if name.startswith("T_") and (rows := getattr(checked, name)) is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import cv2
 
 import semantic_mapper.drivers.v4l2.ioctls as ioctls
+from semantic_mapper.config import nearest
 from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.calibration import require_calibration
 from semantic_mapper.drivers.live import CaptureDevice, LiveCamera
@@ -139,9 +139,7 @@ def apply_controls(path: Path, config: Config) -> list[str]:
         wanted = [(s, by_id[mode], value) for s, mode, value in modes if mode in by_id]
         for setting, control, value in [*wanted, *(row for row in values if row[2] is not None)]:
             if control is None:
-                near = difflib.get_close_matches(setting, controls, n=1, cutoff=0.5)
-                hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(controls) or 'none'}"
-                warnings.append(f"it has no control '{setting}'; {hint}")
+                warnings.append(f"it has no control '{setting}'{nearest(setting, [*controls])}")
                 continue
             value = control.default if value is None else value
             try:

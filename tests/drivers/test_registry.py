@@ -12,7 +12,7 @@ from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [("v4l", "did you mean 'v4l2'?"), ("ros", "there are v4l2, opencv, stereo, oak, realsense")]
+    ("kind", "says"), [("v4l", "did you mean `v4l2`?"), ("ros", "there are v4l2, opencv, stereo, oak, realsense")]
 )
 def test_an_unknown_kind_is_told_with_those_that_there_are(kind: str, says: str) -> None:
     with pytest.raises(ConfigError) as caught:

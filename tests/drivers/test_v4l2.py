@@ -211,10 +211,10 @@ def test_controls_that_do_not_follow_are_told(machine: Machine, tmp_path: Path) 
         told = " / ".join(camera.warnings)
     assert "requested exposure_time_absolute = 5000, it has 2047; exposure_time_absolute goes from 3 to 2047" in told
     assert "gain: requested gain = 101, it has 100" in told
-    assert "no control 'focus_absolut'; did you mean 'focus_absolute'?" in told
+    assert "no control 'focus_absolut'; did you mean `focus_absolute`?" in told
     bare = machine.plug(Sensor(controls=()), 1, link="usb-Bare-video-index0")
     with v4l2(bare, tmp_path, gain=3) as camera:
-        assert "it has no control 'gain'; it has none" in camera.warnings[0]
+        assert "it has no control 'gain'; there are none" in camera.warnings[0]
 
 
 def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -> None:

@@ -33,8 +33,8 @@ def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type)
 @pytest.mark.parametrize(
     ("config", "reason"),
     [
-        ({}, "kind must be one of device, fixed, topic, board, rgbd, visual, got None"),
-        ({"kind": "bord"}, "did you mean 'board'"),
+        ({}, "no kind of poses is called None; there are device, fixed, topic, board, rgbd, visual"),
+        ({"kind": "bord"}, "did you mean `board`"),
         ({"kind": "topic"}, "endpoint"),
         ({"kind": "board", "column": 3}, "did you mean `columns`"),
         ({"kind": "board", "square_m": 0.02}, "must be smaller than square_m"),
