@@ -18,7 +18,7 @@ from semantic_mapper.config import Config
 from semantic_mapper.drivers.lens import lens_intrinsics
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.files import read_regular
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.geometry import check_pose, nearest_pixels
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import decode_image_file, depth_from_uint16
@@ -193,6 +193,23 @@ def metres(values: NDArray[np.generic], units_per_m: float) -> Float32:
     depth_m = (values.astype(np.float64) / units_per_m).astype(np.float32)
     depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0
     return depth_m
+
+
+def depth_of_points(points: Float64, intrinsics: CameraIntrinsics, reach: tuple[int, int] = (0, 0)) -> Float32:
+    """Depth (H, W) in metres that points (N, 3) of the camera's frame give it, 0 where none falls; the nearest wins.
+
+    Each also fills the pixels beside it and above, as many as ``reach`` says of columns and rows.
+    """
+    across, up = reach
+    k = intrinsics
+    size = (k.width + 2 * across, k.height + 2 * up)
+    around = CameraIntrinsics(k.fx, k.fy, k.cx + across, k.cy + up, *size)
+    inside, rows, columns = nearest_pixels(points, around)
+    depth = np.full((around.height, around.width), np.inf, np.float32)
+    np.minimum.at(depth, (rows[inside], columns[inside]), points[inside, 2].astype(np.float32))
+    depth = np.asarray(cv2.erode(depth, np.ones((2 * up + 1, 2 * across + 1), np.uint8)))
+    depth = depth[up : up + k.height, across : across + k.width]
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
 def _read_numpy(file: Path) -> NDArray[np.generic]:

@@ -20,7 +20,6 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
@@ -33,6 +32,7 @@ from semantic_mapper.replay.importers.base import (
     ImportOptions,
     camera_of,
     check_label,
+    depth_of_points,
     read_bytes,
     read_plane,
 )
@@ -246,26 +246,13 @@ def _read_semantics(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt
 
 
 def depth_of_scan(points: Float64, T_camera_scanner: Float64, intrinsics: CameraIntrinsics) -> Float32:
-    """Depth image (H, W) of a scan, 0 where no beam went.
+    """Depth image (H, W) of a scan, (N, 3) in the scanner's axes; 0 where no beam went.
 
     A point fills the pixels between its beam and the next ones, the nearest point wins: so what the camera does not see
     but the scanner on the roof does is hidden by what stands before it.
-
-    Args:
-        points: (N, 3) in the scanner's axes.
-        T_camera_scanner: (4, 4).
-        intrinsics: Of the camera.
     """
-    k = intrinsics
     p = transform(T_camera_scanner, points)
     p = p[np.isfinite(p).all(axis=1) & (p[:, 2] > MIN_SCAN_M)]
-    uv = np.rint(p[:, :2] / p[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy))
-    half_u, half_v = (int(np.ceil((f * step - 1) / 2)) for f, step in zip((k.fx, k.fy), BEAM_STEP_RAD, strict=True))
-    margin = np.array((half_u, half_v))
-    inside = ((uv >= -margin) & (uv < np.array((k.width, k.height)) + margin)).all(axis=1)
-    u, v = (uv[inside] + margin).astype(np.int64).T
-    depth = np.full((k.height + 2 * half_v, k.width + 2 * half_u), np.inf, np.float32)
-    np.minimum.at(depth, (v, u), p[inside, 2].astype(np.float32))
-    depth = np.asarray(cv2.erode(depth, np.ones((2 * half_v + 1, 2 * half_u + 1), np.uint8)))
-    depth = depth[half_v : half_v + k.height, half_u : half_u + k.width]
-    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+    focals = (intrinsics.fx, intrinsics.fy)
+    across, up = (int(np.ceil((f * step - 1) / 2)) for f, step in zip(focals, BEAM_STEP_RAD, strict=True))
+    return depth_of_points(p, intrinsics, (across, up))

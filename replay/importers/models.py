@@ -24,7 +24,7 @@ import numpy as np
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import numeric_order
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.geometry import invert_pose, project, transform
 from semantic_mapper.replay.importers.base import PICTURES, BadFrameError, DepthScale, ImportOptions, camera_of
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
@@ -281,7 +281,7 @@ def _median_depth(points: Float64, pictures: list[PosedPicture], poses: Float64)
     for picture, T_camera_model in zip(pictures[::step], invert_pose(poses[::step]), strict=True):
         k, p = picture.intrinsics, transform(T_camera_model, points)
         p = p[p[:, 2] > 0]
-        u, v = k.fx * p[:, 0] / p[:, 2] + k.cx, k.fy * p[:, 1] / p[:, 2] + k.cy
+        u, v = project(p, k).T
         depths.append(p[(u > 0) & (u < k.width) & (v > 0) & (v < k.height), 2])
     found = np.concatenate(depths)
     return float(np.median(found)) if len(found) else 0.0

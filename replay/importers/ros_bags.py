@@ -7,10 +7,10 @@ PNG; of 32FC1 it holds the inverse depth, quantised.
 
 from __future__ import annotations
 
-import importlib
 import re
 import struct
 import tempfile
+from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,28 +25,22 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from semantic_mapper.errors import (
-    CodecError,
-    ConfigError,
-    DependencyError,
-    ImportSourceError,
-    SemanticMapperError,
-)
+from semantic_mapper.errors import CodecError, ConfigError, ImportSourceError, SemanticMapperError
 from semantic_mapper.files import open_regular
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.importers.base import camera_of, metres
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _PACKED = (".zstd", ".zst")
-_MCAP_MAGIC, _SQLITE_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0"
-_HEAD_BYTES = 1 << 15
+_MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}  # what the two kinds of files begin with
 LISTED = 12  # topics that an error names
 LOOKED_AT = 100  # messages of a topic until one tells what it is
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-# What gives the pose of a frame that it names, and what gives one without saying whose.
-NAMED_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
-POSES = (*NAMED_POSES, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+POSES = (
+    *("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"),  # with the name of the frame that they are of
+    *("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
+)
 _IMAGES = (("sensor_msgs/msg/Image", "encoding"), ("sensor_msgs/msg/CompressedImage", "format"))
 _REPAIR = (
     "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` repairs a bag whose recorder was killed; one that was "
@@ -79,79 +73,65 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")  # format, and A and B of the qua
 
 def is_bag(src: Path) -> bool:
     """Whether a file is a bag, or a folder is one of ROS 2, complete or without its metadata."""
-    if not src.is_dir():
-        return _is_bag_file(src)
-    files = _storage_files(src)
-    return bool(files) and ((src / "metadata.yaml").exists() or all(map(_is_bag_file, files)))
-
-
-def _is_bag_file(file: Path) -> bool:
-    if file.suffix == ".mcap":
-        return _holds_ros2(file)
-    if file.suffix in _PACKED:
-        try:
-            with file.open("rb") as source, zstandard.ZstdDecompressor().stream_reader(source) as packed:
-                return packed.read(_HEAD_BYTES).startswith((_MCAP_MAGIC, _SQLITE_MAGIC))
-        except (OSError, zstandard.ZstdError):
-            return False
-    return file.suffix in (".bag", ".db3")  # one that is damaged is still a bag
+    if src.is_dir():
+        files = _storage_files(src)
+        return bool(files) and ((src / "metadata.yaml").exists() or all(map(is_bag, files)))
+    if src.suffix == ".mcap":
+        return _ros_profile(src) is not None
+    return src.suffix in (".bag", ".db3") or _packed_suffix(src) != ""  # one that is damaged is still a bag
 
 
 def _storage_files(folder: Path) -> list[Path]:
     """Files of a folder that may be parts of a bag of ROS 2."""
-    return sorted(f for f in folder.iterdir() if f.suffix in (".mcap", ".db3", *_PACKED)) if folder.is_dir() else []
+    return sorted(f for f in folder.iterdir() if f.suffix in (".mcap", ".db3", *_PACKED))
 
 
-def _head(file: Path) -> bytes:
-    """The first bytes of a file; none where it cannot be read."""
+def _packed_suffix(file: Path) -> str:
+    """Suffix of the bag that a packed file holds; empty = it holds none."""
+    if file.suffix not in _PACKED:
+        return ""
     try:
-        with open_regular(file) as opened:
-            return opened.read(_HEAD_BYTES)
-    except (OSError, ConfigError):
-        return b""
+        with open_regular(file) as source, zstandard.ZstdDecompressor().stream_reader(source) as packed:
+            head = packed.read(max(map(len, _MAGIC)))
+    except (OSError, ConfigError, zstandard.ZstdError):
+        return ""
+    return next((suffix for magic, suffix in _MAGIC.items() if head.startswith(magic)), "")
 
 
-def _profile(file: Path) -> bytes:
-    """That of an MCAP file: after magic, op code, and the lengths of the record and of it."""
-    head = _head(file)
-    return head[21 : 21 + int.from_bytes(head[17:21], "little")] if head.startswith(_MCAP_MAGIC) else b"ros2"
-
-
-def _holds_ros2(file: Path) -> bool:
-    """Whether an MCAP file is a bag of ROS 2: by its profile, or, where `mcap merge` left it empty, by its schemas."""
-    if _profile(file):
-        return _profile(file) == b"ros2" and _head(file).startswith(_MCAP_MAGIC)
+def _ros_profile(file: Path) -> str | None:
+    """The profile of an MCAP file: "ros2", or "" where `mcap merge` left it empty; None = it is no bag of ROS 2."""
     try:
-        with file.open("rb") as source:
-            schema, _, _ = next(iter(make_reader(source).iter_messages()))
-            return schema is not None and schema.encoding in ("ros2msg", "ros2idl")
-    except (OSError, McapError, StopIteration, ValueError):
-        return False
+        with open_regular(file) as source:
+            reader = make_reader(source)
+            profile = reader.get_header().profile
+            if not profile:
+                schema, _, _ = next(iter(reader.iter_messages()))
+                profile = "" if schema is not None and schema.encoding in ("ros2msg", "ros2idl") else "other"
+    except (OSError, ConfigError, McapError, StopIteration, ValueError, struct.error):
+        return None
+    return profile if profile in ("ros2", "") else None
 
 
-def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str] | None]:
+def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str]]:
     """What rosbags is to open, and the folder of what had to be made for that."""
-    if src.is_dir() and (src / "metadata.yaml").exists():
-        return [src], None
-    files = [src] if src.is_file() else _storage_files(src)
-    if all(file.suffix not in _PACKED and _profile(file) for file in files):
-        return files, None
     folder = tempfile.TemporaryDirectory(prefix="semantic-mapper-bag-")
+    whole = src.is_file() or (src / "metadata.yaml").exists()
     made: list[Path] = []
-    for file in files:
+    for file in [src] if whole else _storage_files(src):
         unpacked = _unpacked(file, Path(folder.name)) if file.suffix in _PACKED else file
-        made.append(unpacked if _profile(unpacked) else _with_profile(unpacked, Path(folder.name)))
+        empty = unpacked.suffix == ".mcap" and _ros_profile(unpacked) == ""
+        made.append(_with_profile(unpacked, Path(folder.name)) if empty else unpacked)
     return made, folder
 
 
 def _unpacked(file: Path, folder: Path) -> Path:
-    path = folder / file.stem
+    path = (folder / file.stem).with_suffix(_packed_suffix(file))
     try:
         with file.open("rb") as packed, path.open("wb") as out:
             zstandard.ZstdDecompressor().copy_stream(packed, out)
     except (OSError, zstandard.ZstdError) as error:
         raise ImportSourceError(f"{file}: cannot be unpacked: {error}; copy it again") from error
-    return path.rename(path.with_suffix(".mcap" if _head(path).startswith(_MCAP_MAGIC) else ".db3"))
+    return path
 
 
 def _with_profile(file: Path, folder: Path) -> Path:
@@ -163,16 +143,16 @@ def _with_profile(file: Path, folder: Path) -> Path:
             writer = Writer(out)
             writer.start(profile="ros2")
             for schema, channel, message in make_reader(source).iter_messages():
-                if channel.id not in channels and schema is not None:
+                if schema is None:
+                    continue
+                if channel.id not in channels:
                     of = writer.register_schema(schema.name, schema.encoding, schema.data)
                     metadata = {"offered_qos_profiles": "", **channel.metadata}
                     channels[channel.id] = writer.register_channel(
                         channel.topic, channel.message_encoding, of, metadata
                     )
-                if channel.id in channels:
-                    writer.add_message(
-                        channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-                    )
+                written = channels[channel.id]
+                writer.add_message(written, message.log_time, message.data, message.publish_time, message.sequence)
             writer.finish()
     except (OSError, McapError, ValueError) as error:
         raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` repairs what was cut off") from error
@@ -197,6 +177,21 @@ class Topic:
     def base(self) -> str:
         """Name without the transport."""
         return self.name if self.raw else re.sub("/compressed(Depth)?$", "", self.name)
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether it shows depth; the name decides where the encoding leaves it open."""
+        named = self._pixels == "mono16" and "depth" in self.name.lower()
+        return "compressedDepth" in self.encoding or self._pixels in ("16UC1", "32FC1") or named
+
+    @property
+    def is_grey(self) -> bool:
+        """Whether its images have no colour."""
+        return self._pixels in ("mono8", "8UC1")
+
+    @property
+    def _pixels(self) -> str:
+        return re.split("[; ]", self.encoding.strip())[0]
 
     def __str__(self) -> str:
         return f"{self.name} ({visible(self.encoding)})"
@@ -242,24 +237,16 @@ class Calibration:
 
 
 class Bag:
-    """A bag that is open, by the names of its topics.
-
-    Raises ImportSourceError: it cannot be read. DependencyError: the package is missing.
-    """
+    """A bag that is open, by the names of its topics. Raises ImportSourceError: it cannot be read."""
 
     def __init__(self, src: Path) -> None:
-        try:
-            highlevel, typesys = (importlib.import_module(f"rosbags.{name}") for name in ("highlevel", "typesys"))
-        except ImportError as error:
-            raise DependencyError(
-                f"ROS bags cannot be read: {error}. Run `make setup`, or install it yourself: pip install "
-                "'rosbags>=0.11.9'"
-            ) from error
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
         paths, self._unpacked = _readable(src)  # what was made for it is there as long as this is
         with self._explained():
             # Bags of ROS 2 before Iron hold no definitions of their messages; those read here have not changed since.
-            types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-            self._reader = highlevel.AnyReader(paths, default_typestore=types)
+            self._reader: Any = AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
         self._is_ros2: bool = self._reader.is2
         self._streams: dict[str, tuple[int, Iterator[tuple[Any, int, bytes]]]] = {}  # next index, and its messages
@@ -295,22 +282,16 @@ class Bag:
                 node = "" if self._is_ros2 else connection.ext.callerid or ""
                 yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
 
-    def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
-        """One message of a topic; quick where they are read in order.
+    def message(self, name: str, received_ns: list[int], index: int) -> Any:
+        """One message of a topic, quick where they are read in order; ``received_ns`` has the times of all of them.
 
         Raises CodecError: it cannot be read.
-
-        Args:
-            name: Of the topic.
-            series: Stamp and time of recording of all its messages, in the order of recording.
-            index: In ``series``.
         """
         position, stream = self._streams.pop(name, (-1, iter(())))
         try:
             if not 0 <= position <= index:
-                received_ns = series[index][1]
-                position = next(i for i, (_, at_ns) in enumerate(series) if at_ns >= received_ns)
-                stream = iter(self._reader.messages(connections=self._connections({name}), start=received_ns))
+                position = bisect_left(received_ns, received_ns[index])
+                stream = iter(self._reader.messages(connections=self._connections({name}), start=received_ns[index]))
             with self._explained():
                 connection, _, data = next(islice(stream, index - position, None))
                 message = self._reader.deserialize(data, connection.msgtype)
@@ -328,13 +309,6 @@ class Bag:
         whole = not cut and info.binning_x <= 1 and info.binning_y <= 1
         frame = frame_name(info.header.frame_id)
         return Calibration(frame, size, info.distortion_model, K, D, R.reshape(3, 3), P, whole)
-
-    def pose(self, topic: str, message: Any) -> tuple[Any, Any]:
-        """Position and rotation of a message of a topic of poses."""
-        if self._connections({topic})[0].msgtype == "geometry_msgs/msg/TransformStamped":
-            return message.transform.translation, message.transform.rotation
-        pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
-        return pose.position, pose.orientation
 
     def _connections(self, names: set[str]) -> list[Any]:
         return [c for c in self._reader.connections if c.topic in names]
@@ -357,21 +331,12 @@ def frame_name(name: str) -> str:
     return name.lstrip("/")
 
 
-def is_depth(topic: str, encoding: str) -> bool:
-    """Whether images of this topic are depth.
-
-    Args:
-        topic: Its name, which decides where the encoding leaves it open.
-        encoding: Of an image, or the format of a compressed one.
-    """
-    pixels = re.split("[; ]", encoding.strip())[0]
-    named = "depth" in topic.lower()
-    return "compressedDepth" in encoding or pixels in ("16UC1", "32FC1") or (pixels == "mono16" and named)
-
-
-def is_grey(encoding: str) -> bool:
-    """Whether images of this encoding, or compressed format, have no colour."""
-    return re.split("[; ]", encoding.strip())[0] in ("mono8", "8UC1")
+def position_and_rotation(message: Any) -> tuple[Any, Any]:
+    """Of a message of one of the types ``POSES``."""
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+    return pose.position, pose.orientation
 
 
 def color_image(message: Any) -> UInt8:

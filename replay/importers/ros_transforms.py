@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import combinations, pairwise
+from itertools import chain, combinations_with_replacement, pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose, pose_matrix
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import MATCH_NS
-from semantic_mapper.replay.importers.ros_bags import frame_name
+from semantic_mapper.replay.importers.ros_bags import frame_name, position_and_rotation
 from semantic_mapper.replay.importers.tables import MAX_NORM_ERROR
 from semantic_mapper.replay.importers.tum import pose_at
 from semantic_mapper.types import Float64
@@ -34,21 +33,20 @@ _WINDOW = 80  # poses that are judged together
 
 
 class Track:
-    """Poses over time, or, where they are ``fixed``, the last of them at any time.
+    """Poses over time, at least one, or, where they are ``fixed``, the last of them at any time.
 
     Stamps may come in any order; of one stamp the last row, tx ty tz qx qy qz qw, counts. ``doubled`` is how many have
     the stamp of another one and differ from it.
     """
 
     def __init__(self, stamps_ns: list[int], rows: list[tuple[float, ...]], *, fixed: bool = False) -> None:
-        stamps = np.array(stamps_ns, np.int64)
-        order = np.argsort(stamps, kind="stable")
-        self._all_stamps_ns: NDArray[np.int64] = stamps[order]
-        self._all_rows = np.array(rows, np.float64).reshape(-1, 7)[order]
+        order = np.argsort(stamps_ns, kind="stable")
+        self._all_stamps_ns: NDArray[np.int64] = np.array(stamps_ns, np.int64)[order]
+        self._all_rows = np.array(rows, np.float64)[order]
         again = np.diff(self._all_stamps_ns) == 0
+        last = np.append(~again, True)
         self.fixed = fixed
         self.doubled = int((again & np.any(np.diff(self._all_rows, axis=0) != 0, axis=1)).sum())
-        last = np.append(~again, [True] * bool(rows))
         self.stamps_ns: NDArray[np.int64] = self._all_stamps_ns[last]  # (N,) rising
         self._rows = self._all_rows[last]
 
@@ -80,7 +78,7 @@ class Track:
         a pair fits, one source wrote the pose and the pair, another the poses between. Noise has no such pairs, and
         poses that are published several times each make no detours. One source may have 3 times the rate of the other.
         """
-        if self.fixed or not len(self._all_rows):
+        if self.fixed:
             return 0.0
         rotations = Rotation.from_quat(self._all_rows[:, 3:]).as_matrix()
         x = np.hstack((self._all_rows[:, :3], rotations[:, :, :2].reshape(-1, 6)))
@@ -109,65 +107,75 @@ class Track:
 
 
 @dataclass(slots=True)
-class _Published:
-    """What one source publishes of where one frame sits."""
+class PoseSeries:
+    """Poses of one frame as one source publishes them, in the order of recording."""
 
-    topic: str
     stamps_ns: list[int] = field(default_factory=list[int])
-    rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])
-    received_ns: list[int] = field(default_factory=list[int])
-    track: Track = field(init=False)  # once all are in
+    received_ns: list[int] = field(default_factory=list[int])  # stand for the stamps of those that have none
+    rows: list[tuple[float, ...]] = field(default_factory=list[tuple[float, ...]])  # tx ty tz qx qy qz qw
+    refused: int = 0  # that hold NaN or no rotation
 
-    @property
-    def fixed(self) -> bool:
-        return self.topic.endswith("tf_static")
+    def add(self, message: Any, received_ns: int) -> bool:
+        """Take in a message with a pose; whether that can be used."""
+        p, q = position_and_rotation(message)
+        row = tuple(float(value) for value in (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
+            self.refused += 1
+            return False
+        self.stamps_ns.append(stamp_of(message.header))
+        self.received_ns.append(received_ns)
+        self.rows.append(row)
+        return True
+
+    def track(self, name: str, notices: list[str], *, fixed: bool = False) -> Track | None:
+        """The poses, None without any; ``notices`` gets sentences on what is odd about them."""
+        if self.refused:
+            notices.append(f"{name}: {counted(self.refused, 'pose')} left out: they hold NaN or no rotation")
+        if not self.rows:
+            return None
+        if fixed:
+            self.stamps_ns = list(range(len(self.rows)))  # the last that was recorded counts
+        else:
+            notices += fill_stamps(self.stamps_ns, self.received_ns, name)
+        track = Track(self.stamps_ns, self.rows, fixed=fixed)
+        if track.doubled:
+            notices.append(f"{name}: {counted(track.doubled, 'pose')} with the stamp of another one; the last counts")
+        return track
 
 
 class TransformTree:
     """All transforms of a bag; ``close`` it once they are in."""
 
     def __init__(self) -> None:
-        self._refused = 0  # transforms that hold NaN or no rotation
-        self._published: dict[str, dict[str, _Published]] = {}  # by child and source
+        self._series: dict[str, dict[str, PoseSeries]] = {}  # by child and source, as of ``add``
         self._parents: dict[str, set[str]] = {}
+        self._sources: dict[str, dict[str, Track]] = {}
         self._tracks: dict[str, Track] = {}  # of all sources that move a frame, or else of the last one
 
-    def add(self, transforms: Iterable[Any], topic: str, program: str, received_ns: int) -> None:
-        """Take in the ``geometry_msgs/TransformStamped`` of one message.
-
-        Those of a topic tf_static are fixed. ``program`` published it (empty = not known), at ``received_ns``, which
-        stands for the stamps of those that have none.
-        """
-        source = f"{topic} of {program}" if program else topic
-        for stamped in transforms:
-            row = pose_row(stamped.transform.translation, stamped.transform.rotation)
-            child, parent = frame_name(stamped.child_frame_id), frame_name(stamped.header.frame_id)
-            if row is None or not child or child == parent:
-                self._refused += 1
-                continue
+    def add(self, stamped: Any, source: str, received_ns: int) -> None:
+        """Take in a ``geometry_msgs/TransformStamped``. The source is "TOPIC of PROGRAM"; tf_static's are fixed."""
+        child, parent = frame_name(stamped.child_frame_id), frame_name(stamped.header.frame_id)
+        if child in ("", parent):
+            return
+        if self._series.setdefault(child, {}).setdefault(source, PoseSeries()).add(stamped, received_ns):
             self._parents.setdefault(child, set()).add(parent)
-            given = self._published.setdefault(child, {}).setdefault(source, _Published(topic))
-            given.stamps_ns.append(stamp_of(stamped.header))
-            given.received_ns.append(received_ns)
-            given.rows.append(row)
 
     def close(self) -> list[str]:
         """Sort what was taken in; sentences on what is odd about it."""
         notices: list[str] = []
-        if self._refused:
-            notices.append(f"{self._refused} transforms of tf are left out: they hold NaN or no rotation")
-        for child, sources in self._published.items():
-            for given in sources.values():
-                if given.fixed:
-                    given.stamps_ns = list(range(len(given.rows)))  # the last that was recorded counts
-                else:
-                    notices += fill_stamps(given.stamps_ns, given.received_ns, f"tf of '{child}'")
-                given.track = Track(given.stamps_ns, given.rows, fixed=given.fixed)
-                notices += doubled_notice(given.track, f"tf of '{child}'")
-            moving = [given for given in sources.values() if not given.fixed] or [*sources.values()][-1:]
-            stamps_ns = [stamp for given in moving for stamp in given.stamps_ns]
-            rows = [row for given in moving for row in given.rows]
-            self._tracks[child] = Track(stamps_ns, rows, fixed=moving[0].fixed)
+        for child, given in self._series.items():
+            tracks = {
+                source: series.track(f"tf of '{child}'", notices, fixed=_topic(source).endswith("tf_static"))
+                for source, series in given.items()
+            }
+            sources = self._sources[child] = {source: track for source, track in tracks.items() if track is not None}
+            moving = [given[source] for source, track in sources.items() if not track.fixed]
+            if moving:
+                stamps_ns = chain.from_iterable(series.stamps_ns for series in moving)
+                rows = chain.from_iterable(series.rows for series in moving)
+                self._tracks[child] = Track(list(stamps_ns), list(rows))
+            elif sources:
+                self._tracks[child] = [*sources.values()][-1]
         return notices
 
     def check(self, target: str, source: str) -> None:
@@ -175,23 +183,14 @@ class TransformTree:
 
         Raises ImportSourceError: two programs publish one transform and differ.
         """
-        for child in {*self.way_up(source)} ^ {*self.way_up(target)}:
-            if child not in self._published:
-                continue
+        for child in ({*self.way_up(source)} ^ {*self.way_up(target)}) & self._tracks.keys():
             what = f"tf: '{child}' on '{next(iter(self._parents[child]))}'"
-            sources = self._published[child]
-            for name, given in sources.items():
-                if given.fixed and given.track.differs(given.track, unless_apart=True):
+            for (a, track), (b, other) in combinations_with_replacement(self._sources[child].items(), 2):
+                one, another = (track, other) if other.fixed else (other, track)  # a fixed one has no times
+                if one.differs(another, unless_apart=_topic(a) == _topic(b)):
                     raise ImportSourceError(
-                        f"{what} is fixed, but {name} says two things: cut the bag between them, or record the true "
-                        "one alone"
-                    )
-            for (a, given), (b, other) in combinations(sources.items(), 2):
-                one, another = (given, other) if other.fixed else (other, given)  # a fixed one has no times
-                if one.track.differs(another.track, unless_apart=given.topic == other.topic):
-                    raise ImportSourceError(
-                        f"{what} is published by {a} and, otherwise, by {b}: record the true one alone, or keep "
-                        "only it in the bag (`rosbag filter`, `ros2 bag convert`)"
+                        f"{what} is published by {a} and, otherwise, by {b}: record the true one alone, cut the bag "
+                        "between the two, or keep only one in it (`rosbag filter`, `ros2 bag convert`)"
                     )
             if jump := self._tracks[child].jump_m():
                 raise ImportSourceError(
@@ -225,31 +224,25 @@ class TransformTree:
             way.append(parents[0])
         return way
 
-    def reaches(self, a: str, b: str) -> bool:
-        """Whether the two frames are in one tree."""
-        return self.way_up(a)[-1] == self.way_up(b)[-1]
-
     def lookup(self, target: str, source: str, stamp_ns: int, within_ns: int = MATCH_NS) -> Float64 | None:
         """``T_target_source`` (4, 4) at a time; None where tf tells nothing of that time, or the two do not meet."""
         up, down = self.way_up(source), self.way_up(target)
-        meeting = next((frame for frame in up if frame in down), None)
-        if meeting is None:
+        if up[-1] != down[-1]:
             return None
-        T_meeting_source = self._climb(up[: up.index(meeting)], stamp_ns, within_ns)
-        T_meeting_target = self._climb(down[: down.index(meeting)], stamp_ns, within_ns)
-        if T_meeting_source is None or T_meeting_target is None:
-            return None
-        return invert_pose(T_meeting_target) @ T_meeting_source
+        T_meeting: list[Float64] = []  # from the frame in which the two ways meet to source and target
+        for way, other in ((up, down), (down, up)):
+            T_meeting.append(np.eye(4))
+            for frame in way:
+                if frame not in other:
+                    T_parent_frame = self._tracks[frame].at(stamp_ns, within_ns)
+                    if T_parent_frame is None:
+                        return None
+                    T_meeting[-1] = T_parent_frame @ T_meeting[-1]
+        return invert_pose(T_meeting[1]) @ T_meeting[0]
 
-    def _climb(self, way: list[str], stamp_ns: int, within_ns: int) -> Float64 | None:
-        """From the parent of the last frame of ``way`` to its first."""
-        T = np.eye(4)
-        for frame in way:
-            step = self._tracks[frame].at(stamp_ns, within_ns)
-            if step is None:
-                return None
-            T = step @ T
-        return T
+
+def _topic(source: str) -> str:
+    return source.partition(" of ")[0]
 
 
 def stamp_of(header: Any) -> int:
@@ -270,18 +263,3 @@ def fill_stamps(stamps_ns: list[int], received_ns: list[int], name: str) -> list
     if not missing:
         return []
     return [f"{name}: {counted(len(missing), 'message')} without a stamp; the time of receipt stands for it"]
-
-
-def doubled_notice(track: Track, name: str) -> list[str]:
-    """A sentence on two poses of one stamp; empty without any."""
-    if not track.doubled:
-        return []
-    return [f"{name}: {counted(track.doubled, 'pose')} with the stamp of another one; the last counts"]
-
-
-def pose_row(position: Any, rotation: Any) -> tuple[float, ...] | None:
-    """tx ty tz qx qy qz qw of two messages; None where they hold NaN or no rotation."""
-    row = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
-    if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
-        return None
-    return tuple(float(value) for value in row)

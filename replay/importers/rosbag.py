@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +19,18 @@ from numpy.typing import NDArray
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import CodecError, ImportSourceError
 from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
-from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     MATCH_NS,
     BadFrameError,
     DepthScale,
     ImportOptions,
+    depth_of_points,
     same_view,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, depth_of_size
 from semantic_mapper.replay.importers.ros_bags import (
     CAMERA_INFO,
     LISTED,
-    NAMED_POSES,
     POSES,
     TF,
     UNITS_PER_M,
@@ -43,16 +41,13 @@ from semantic_mapper.replay.importers.ros_bags import (
     compressed_depth_image,
     depth_image,
     frame_name,
-    is_depth,
-    is_grey,
 )
 from semantic_mapper.replay.importers.ros_transforms import (
     WORLD_FRAMES,
+    PoseSeries,
     Track,
     TransformTree,
-    doubled_notice,
     fill_stamps,
-    pose_row,
     stamp_of,
 )
 from semantic_mapper.replay.importers.tum import match_nearest
@@ -73,14 +68,9 @@ _VIEWER = (
 
 
 def open_rosbag(src: Path, options: ImportOptions) -> PosedPictures:
-    """A bag, opened; one frame for each image of one camera.
+    """A bag, ``.bag``, ``.mcap``, ``.db3`` or folder of ROS 2, opened; one frame for each image of one camera.
 
     Raises ImportSourceError: damaged, no image, several cameras where none is named, no calibration, or no poses.
-    DependencyError: the package ``rosbags`` is not installed.
-
-    Args:
-        src: ``.bag``, ``.mcap`` or ``.db3`` file, or folder of ROS 2.
-        options: See ``ImportOptions``.
     """
     try:
         return _BagReader(src, options).pictures()
@@ -105,10 +95,10 @@ class _BagReader:
             raise ImportSourceError(
                 f"has no poses: neither tf nor a topic of {kinds}; it has {self._bag.listing()}{hint}"
             )
-        info = self._info_topic(self._color, options.topics.get("info", ""))
-        depth_info = options.topics.get("depth_info", "")
-        if self._depth is not None and (depth_info or _info_name(self._depth) in self._bag.topics(CAMERA_INFO)):
-            depth_info = self._info_topic(self._depth, depth_info)
+        info, depth_info = self._info_topic(self._color, "info"), ""
+        if self._depth is not None:
+            own = "depth_info" in options.topics or _info_name(self._depth) in self._bag.topics(CAMERA_INFO)
+            depth_info = self._info_topic(self._depth, "depth_info") if own else ""
         self._read_all()
         self._frame = self._color.frame or self._calibrations[info][0].frame
         self._measured = self._intrinsics(self._color, info)
@@ -118,13 +108,12 @@ class _BagReader:
         self._registration: tuple[CameraIntrinsics, Float64] | None = None  # of depth, and T_color_depth; None = it is
         if self._depth is not None:
             self._registration = self._link_depth(self._depth, depth_info)
-        self._moving: list[tuple[str, Track]] = []  # what poses are made of that changes over time
         self._pose_at = self._pose_source()
-        self._check_times()
 
     def pictures(self) -> PosedPictures:
         """The images with poses and depth; each is named by its topic and its number in the bag."""
-        stamps, depth_stamps = self._stamps(self._color), self._stamps(self._depth)
+        stamps = self._stamps[self._color.name]
+        depth_stamps = np.zeros(0, np.int64) if self._depth is None else self._stamps[self._depth.name]
         order, depth_order = (np.argsort(found, kind="stable") for found in (stamps, depth_stamps))
         matches = match_nearest(stamps[order], depth_stamps[depth_order], MATCH_NS)
         pictures: list[PosedPicture] = []
@@ -148,13 +137,9 @@ class _BagReader:
             read_depth=self._depth_m,
         )
 
-    def _stamps(self, topic: Topic | None) -> NDArray[np.int64]:
-        """Of the images of a topic, in the order of recording."""
-        return np.array([stamp for stamp, _ in self._series[topic.name]] if topic else [], np.int64)
-
     def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
         try:
-            message = self._bag.message(self._color.name, self._series[self._color.name], int(file.name))
+            message = self._bag.message(self._color.name, self._received[self._color.name], int(file.name))
             if self._color.raw:
                 return color_image(message), None
             data = message.data.tobytes()
@@ -166,7 +151,8 @@ class _BagReader:
     def _depth_m(self, picture: PosedPicture, lens: Rectifier) -> Float32:
         assert self._depth is not None and picture.depth_file is not None
         try:
-            message = self._bag.message(self._depth.name, self._series[self._depth.name], int(picture.depth_file.name))
+            received_ns = self._received[self._depth.name]
+            message = self._bag.message(self._depth.name, received_ns, int(picture.depth_file.name))
             depth_m = depth_image(message) if self._depth.raw else compressed_depth_image(message)
         except CodecError as error:
             raise BadFrameError(picture.depth_file, str(error)) from error
@@ -181,15 +167,16 @@ class _BagReader:
                 f"{own.width}x{own.height}; name the one that it has (--topic depth_info=NAME), or import without "
                 "depth (--topic depth=none)",
             )
-        return register_depth(depth_m, own, T_color_depth, lens.intrinsics)
+        points = transform(T_color_depth, unproject(depth_m, own)[depth_m > 0])
+        return depth_of_points(points, lens.intrinsics)
 
     def _find_images(self) -> tuple[Topic, Topic | None]:
         """The topics of colour and of depth."""
         topics, wanted = self._bag.image_topics(), self._options.topics
-        depths = [t for t in topics if is_depth(t.name, t.encoding)]
+        depths = [t for t in topics if t.is_depth]
         colors = [t for t in topics if t not in depths]
         fitting = _without_doubles(colors)
-        color = self._choose("image", colors, [t for t in fitting if not is_grey(t.encoding)] or fitting)
+        color = self._choose("image", colors, [t for t in fitting if not t.is_grey] or fitting)
         left = [str(t) for t in fitting if t != color]
         if "image" not in wanted and left:
             self.notices.append(f"images are those of {color.name}; there are also {', '.join(left[:LISTED])}")
@@ -203,23 +190,30 @@ class _BagReader:
 
     def _choose(self, role: str, topics: list[Topic], fitting: list[Topic]) -> Topic:
         """The one of the topics that is named, or else the only one that fits."""
-        name = self._options.topics.get(role)
-        found = fitting if name is None else [topic for topic in topics if topic.name == name][:1]
-        if len(found) == 1:
-            return found[0]
-        there = ", ".join(map(str, (found or topics)[:LISTED])) or "none"
-        if found:
-            raise ImportSourceError(f"several topics fit the {role}: {there}; name one: --topic {role}={found[0].name}")
-        if name is not None:
-            raise ImportSourceError(f"no topic '{name}' of images for {role}; there are {there}")
-        raise ImportSourceError(f"no topic has images; there are {self._bag.listing()}")
+        name = self._named(role, [topic.name for topic in topics])
+        found = [topic for topic in topics if topic.name == name] or fitting
+        if not found:
+            raise ImportSourceError(f"no topic has images; there are {self._bag.listing()}")
+        if not name and len(found) > 1:
+            raise _several(role, [str(topic) for topic in found], found[0].name)
+        return found[0]
 
-    def _info_topic(self, topic: Topic, wanted: str) -> str:
+    def _named(self, role: str, names: list[str]) -> str:
+        """The topic that the user names for a role, out of these; empty = none is named."""
+        name = self._options.topics.get(role, "")
+        if name and name not in names:
+            raise ImportSourceError(
+                f"no topic '{name}' fits the {role}; there are {', '.join(names[:LISTED]) or 'none'}"
+            )
+        return name
+
+    def _info_topic(self, topic: Topic, role: str) -> str:
         """The topic of the calibration of images."""
-        infos, name = self._bag.topics(CAMERA_INFO), wanted or _info_name(topic)
+        infos = self._bag.topics(CAMERA_INFO)
+        name = self._named(role, infos) or _info_name(topic)
         if name in infos:
             return name
-        if not wanted and len(infos) == 1:
+        if len(infos) == 1:
             self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
             return infos[0]
         others = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME"
@@ -232,27 +226,30 @@ class _BagReader:
         """One pass over the bag: times of images, calibrations, transforms and poses, by topic."""
         images = {topic.name for topic in (self._color, self._depth) if topic is not None}
         infos, poses, transforms = (set(self._bag.topics(*kinds)) for kinds in ((CAMERA_INFO,), POSES, TF))
-        self._calibrations: dict[str, list[Calibration]] = {name: [] for name in infos}
-        self._poses: dict[str, list[tuple[int, Any]]] = {name: [] for name in poses}
-        self._tree = TransformTree()
         stamps: dict[str, list[int]] = {name: [] for name in images}
-        received: dict[str, list[int]] = {name: [] for name in images}
+        self._received: dict[str, list[int]] = {name: [] for name in images}
+        self._calibrations: dict[str, list[Calibration]] = {name: [] for name in infos}
+        self._poses = {name: PoseSeries() for name in poses}
+        self._bodies: dict[str, str] = {}  # of topics of poses that tell whose they are
+        self._tree = TransformTree()
         for name, received_ns, message, node in self._bag.messages(images | infos | poses | transforms):
             if name in images:
                 stamps[name].append(stamp_of(message.header))
-                received[name].append(received_ns)
+                self._received[name].append(received_ns)
             elif name in infos:
                 found, known = self._bag.calibration(message), self._calibrations[name]
                 if found.says_something or not known:
                     known[:] = [*(old for old in known if old.says_something), found]
             elif name in transforms:
-                self._tree.add(message.transforms, name, node, received_ns)
+                for stamped in message.transforms:
+                    self._tree.add(stamped, f"{name} of {node}" if node else name, received_ns)
             else:
-                self._poses[name].append((received_ns, message))
+                self._poses[name].add(message, received_ns)
+                self._bodies.setdefault(name, getattr(message, "child_frame_id", ""))
         self.notices += self._tree.close()
         for name in images:
-            self.notices += fill_stamps(stamps[name], received[name], name)
-        self._series = {name: list(zip(stamps[name], received[name], strict=True)) for name in images}
+            self.notices += fill_stamps(stamps[name], self._received[name], name)
+        self._stamps = {name: np.array(values, np.int64) for name, values in stamps.items()}
 
     def _intrinsics(self, topic: Topic, info: str) -> CameraIntrinsics:
         """Of the images of a topic."""
@@ -304,24 +301,16 @@ class _BagReader:
         color, own = self._measured, self._intrinsics(depth, info)
         frame = depth.frame or self._calibrations[info][0].frame
         one_lens = own.distortion == color.distortion and _one_lens(color, own)
-        T_color_depth: Float64 | None = np.eye(4)
-        if frame != self._frame:
-            T_color_depth = None
-            if self._tree.reaches(self._frame, frame):
-                self._tree.check(self._frame, frame)
-                first_ns = self._series[self._color.name][0][0]
-                T_color_depth = self._tree.lookup(self._frame, frame, first_ns, MAX_STAMP_NS)
+        self._tree.check(self._frame, frame)
+        first_ns = int(self._stamps[self._color.name][0])
+        T_color_depth = self._tree.lookup(self._frame, frame, first_ns, MAX_STAMP_NS)
         if one_lens and T_color_depth is not None and np.allclose(T_color_depth, np.eye(4), atol=_SAME_PLACE):
             return None
-        if own.distorted:
+        if own.distorted or T_color_depth is None:
+            apart = f"is of another camera ({frame}) than {self._color.name} ({self._frame}), and tf does not link them"
             raise ImportSourceError(
-                f"{depth.name} has lens distortion of its own; record depth that is registered to colour, or import "
-                "without it: --topic depth=none"
-            )
-        if T_color_depth is None:
-            raise ImportSourceError(
-                f"{depth.name} is of another camera ({frame}) than {self._color.name} ({self._frame}), and tf does not "
-                "link the two; record tf_static or registered depth, or import without it: --topic depth=none"
+                f"{depth.name} {'has lens distortion of its own' if own.distorted else apart}; record tf_static and "
+                "depth that is registered to colour, or import without it: --topic depth=none"
             )
         if frame == self._frame and "depth_info" not in self._options.topics:
             raise ImportSourceError(
@@ -334,86 +323,73 @@ class _BagReader:
         return own, invert_pose(self._T_frame_image) @ T_color_depth
 
     def _pose_source(self) -> Callable[[int], Float64 | None]:
-        """What tells the pose of a time."""
+        """What tells the pose of a time: tf from the world to the camera, or a topic and tf from there on."""
         topic, frame, tree = self._pose_topic(), self._frame, self._tree
-        if not topic:
-            world = self._world()
-            tree.check(world, frame)
-            self._moving = tree.moving_above(frame, world)
-            self.notices.append(f"poses are those of {frame} in {world}, from tf")
+        base, track = self._track(topic) if topic else (self._world(), None)
+        tree.check(base, frame)
+        if track is None:
+            moving = tree.moving_above(frame, base)
+            self.notices.append(f"poses are those of {frame} in {base}, from tf")
+        else:
+            moving = [(topic, track)]
+            self.notices.append(f"poses are those of {frame}, from {topic} of {base}")
+        stamps_ns = self._stamps[self._color.name]
+        for name, poses in moving:
+            first, last = int(poses.stamps_ns[0]) - MATCH_NS, int(poses.stamps_ns[-1]) + MATCH_NS
+            if stamps_ns.max() < first or stamps_ns.min() > last:
+                raise ImportSourceError(
+                    f"images of {self._color.name} are from {_span(stamps_ns)}, poses ({name}) from "
+                    f"{_span(poses.stamps_ns)}: their clocks differ; record both with one clock (use_sim_time)"
+                )
 
-            def from_tf(stamp_ns: int) -> Float64 | None:
-                T_world_frame = tree.lookup(world, frame, stamp_ns)
-                return None if T_world_frame is None else T_world_frame @ self._T_frame_image
+        def pose_at(stamp_ns: int) -> Float64 | None:
+            T_world_base = np.eye(4) if track is None else track.at(stamp_ns)
+            T_base_frame = tree.lookup(base, frame, stamp_ns)
+            if T_world_base is None or T_base_frame is None:
+                return None
+            return T_world_base @ T_base_frame @ self._T_frame_image
 
-            return from_tf
-        body, track = self._track(topic)
-        if body != frame and not tree.reaches(body, frame):
+        return pose_at
+
+    def _pose_topic(self) -> str:
+        """The topic that poses come from; empty = tf."""
+        found = self._bag.topics(*POSES)
+        name = self._named("pose", found)
+        if name or self._options.world or set(WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
+            return name
+        if len(found) > 1:
+            raise _several("pose", found, found[0])
+        return found[0] if found else ""
+
+    def _track(self, topic: str) -> tuple[str, Track]:
+        """Whose poses a topic tells, and the poses."""
+        body, frame = frame_name(self._options.body or self._bodies[topic]), self._frame
+        if not body:
+            raise ImportSourceError(
+                f"{topic} does not say whose poses it tells; name the frame with --body, such as --body {frame} "
+                "where they are the camera's"
+            )
+        track = self._poses[topic].track(topic, self.notices)
+        if track is None:
+            raise ImportSourceError(f"{topic} holds no pose")
+        if self._tree.way_up(body)[-1] != self._tree.way_up(frame)[-1]:
             raise ImportSourceError(
                 f"{topic} tells where '{body}' is, but tf does not say where the camera '{frame}' sits on it; record "
                 f"tf_static, or say with --body {frame} that the poses are the camera's"
             )
-        tree.check(body, frame)
         if jump := track.jump_m():
             raise ImportSourceError(
                 f"the poses of {topic} jump to and fro by {jump:.2g} m or rad: two programs publish it; record one of "
                 "them, or name another topic: --topic pose=NAME"
             )
-        self._moving = [(topic, track)]
-        self.notices.append(f"poses are those of {frame}, from {topic} of {body}")
-
-        def from_topic(stamp_ns: int) -> Float64 | None:
-            T_world_body, T_body_frame = track.at(stamp_ns), tree.lookup(body, frame, stamp_ns)
-            if T_world_body is None or T_body_frame is None:
-                return None
-            return T_world_body @ T_body_frame @ self._T_frame_image
-
-        return from_topic
-
-    def _pose_topic(self) -> str:
-        """The topic that poses come from; empty = tf."""
-        found, name = self._bag.topics(*POSES), self._options.topics.get("pose", "")
-        if name and name not in found:
-            raise ImportSourceError(f"no topic '{name}' of poses; there are {', '.join(found[:LISTED]) or 'none'}")
-        if name or self._options.world or set(WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
-            return name
-        if len(found) > 1:
-            raise ImportSourceError(
-                f"several topics tell poses: {', '.join(found[:LISTED])}; name one: --topic pose={found[0]}"
-            )
-        return found[0] if found else ""
-
-    def _track(self, topic: str) -> tuple[str, Track]:
-        """Whose poses a topic tells, and the poses."""
-        messages = self._poses[topic]
-        named = topic in self._bag.topics(*NAMED_POSES)
-        body = frame_name(self._options.body or (messages[0][1].child_frame_id if named else ""))
-        if not body:
-            raise ImportSourceError(
-                f"{topic} does not say whose poses it tells; name the frame with --body, such as --body {self._frame} "
-                "where they are the camera's"
-            )
-        stamps = [stamp_of(message.header) for _, message in messages]
-        self.notices += fill_stamps(stamps, [received_ns for received_ns, _ in messages], topic)
-        rows = [pose_row(*self._bag.pose(topic, message)) for _, message in messages]
-        good = [(stamp, row) for stamp, row in zip(stamps, rows, strict=True) if row is not None]
-        if len(good) < len(rows):
-            left_out = counted(len(rows) - len(good), "pose")
-            self.notices.append(f"{left_out} of {topic} left out: they hold NaN or no rotation")
-        if not good:
-            raise ImportSourceError(f"{topic} holds no pose")
-        track = Track([stamp for stamp, _ in good], [row for _, row in good])
-        self.notices += doubled_notice(track, topic)
         return body, track
 
     def _world(self) -> str:
         """The frame of tf in which poses are."""
         way = self._tree.way_up(self._frame)
-        on = " on ".join(f"'{frame}'" for frame in way)
         wanted = frame_name(self._options.world)
-        if wanted and wanted not in way:
-            raise ImportSourceError(f"tf has no way from {self._frame} to {wanted}: {on}")
-        world = next((world for world in (wanted, *WORLD_FRAMES) if world in way), None)
+        worlds = (wanted,) if wanted else WORLD_FRAMES
+        world = next((world for world in worlds if world in way), None)
         if world is not None:
             return world
         if len(way) == 1:
@@ -423,47 +399,21 @@ class _BagReader:
             )
         still = "" if self._tree.moving_above(self._frame, way[-1]) else ", where the camera stood still"
         raise ImportSourceError(
-            f"tf has no frame {', '.join(WORLD_FRAMES)} above the camera: {on}; record tf or odometry, or name a topic "
-            f"of poses (--topic pose=NAME), or the world{still}: --world {way[-1]}"
+            f"tf has no frame {', '.join(worlds)} above the camera: {' on '.join(map(repr, way))}; record tf or "
+            f"odometry, or name a topic of poses (--topic pose=NAME), or the world{still}: --world {way[-1]}"
         )
-
-    def _check_times(self) -> None:
-        """Raises: ImportSourceError: no image was taken while poses were."""
-        stamps = self._stamps(self._color)
-        for name, track in self._moving:
-            first, last = int(track.stamps_ns[0]) - MATCH_NS, int(track.stamps_ns[-1]) + MATCH_NS
-            if len(stamps) and (stamps.max() < first or stamps.min() > last):
-                raise ImportSourceError(
-                    f"images of {self._color.name} are from {_span(stamps)}, poses ({name}) from "
-                    f"{_span(track.stamps_ns)}: their clocks differ; record both with one clock (use_sim_time)"
-                )
-
-
-def register_depth(depth_m: Float32, own: CameraIntrinsics, T_color_depth: Float64, color: CameraIntrinsics) -> Float32:
-    """Depth of one camera in the pixels of another: (H, W) of ``color``, the nearest surface, 0 where none falls.
-
-    Args:
-        depth_m: (h, w) in metres, 0 = no measurement.
-        own: Intrinsics of the depth camera, without distortion.
-        T_color_depth: (4, 4) from the depth camera to the colour camera.
-        color: Intrinsics of the colour camera, without distortion.
-    """
-    points = transform(T_color_depth, unproject(depth_m, own).reshape(-1, 3)[depth_m.ravel() > 0])
-    points = points[points[:, 2] > 0]
-    u = np.rint(color.fx * points[:, 0] / points[:, 2] + color.cx)
-    v = np.rint(color.fy * points[:, 1] / points[:, 2] + color.cy)
-    inside = (u >= 0) & (u < color.width) & (v >= 0) & (v < color.height)
-    pixels = v[inside].astype(np.int64) * color.width + u[inside].astype(np.int64)
-    nearest = np.full(color.height * color.width, np.inf, np.float32)
-    np.minimum.at(nearest, pixels, points[inside, 2].astype(np.float32))
-    nearest[np.isinf(nearest)] = 0
-    return nearest.reshape(color.height, color.width)
 
 
 def _without_doubles(topics: list[Topic]) -> list[Topic]:
     """Of each camera one transport: raw images where there are some."""
     by_base = {t.base: t for t in sorted(topics, key=lambda t: t.raw)}
     return [t for t in topics if t in by_base.values()]
+
+
+def _several(role: str, topics: list[str], first: str) -> ImportSourceError:
+    return ImportSourceError(
+        f"several topics fit the {role}: {', '.join(topics[:LISTED])}; name one: --topic {role}={first}"
+    )
 
 
 def _info_name(topic: Topic) -> str:
