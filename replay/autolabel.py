@@ -32,17 +32,8 @@ from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, Autolabe
 from semantic_mapper.replay.evaluate.things import thing_image
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.format import LogWriter, atomic_log
-from semantic_mapper.replay.log.reader import LogReader
-from semantic_mapper.replay.log.sequence import (
-    PART_ATTACHMENT,
-    Log,
-    LogSequence,
-    Part,
-    open_log,
-    part_path,
-    parts_on_disk,
-    read_part,
-)
+from semantic_mapper.replay.log.reader import PART_ATTACHMENT, LogReader, Part
+from semantic_mapper.replay.log.sequence import Log, open_log, part_path, parts_on_disk
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -92,7 +83,7 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
     """
     monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
-        readers = log.logs if isinstance(log, LogSequence) else [log]
+        readers = [stack.enter_context(LogReader(path, allow_empty=True)) for path in log.paths]
         if any(path.is_dir() and path.resolve() == request.out.parent.resolve() for path in request.logs):
             raise ConfigError(
                 f"{request.out}: lies in the folder of the log's parts, and would be read as one; choose another folder"
@@ -130,7 +121,7 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
         for writer in writers:
             writer.attach(note.attachment())
             writer.flush()
-        damage = tuple(str(error) for error in log.errors)
+        damage = tuple(str(error) for reader in readers for error in reader.errors)
         files = tuple(part_path(request.out, number) for number in range(len(writers)))
         if labeller.instances is not None:
             labeller.instances.finish()
@@ -178,8 +169,8 @@ def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelS
 def _writer(reader: LogReader, path: Path, label_set: LabelSet, name: str) -> AbstractContextManager[LogWriter]:
     """A new log, or part of one, with what the old one keeps next to its messages."""
     kept = [a for a in reader.attachments().values() if a.name not in (PART_ATTACHMENT, AUTOLABEL_ATTACHMENT)]
-    if (part := read_part(reader)) is not None:
-        kept.append(Part(f"{part.recording[:64]}-{name}", part.part).attachment())
+    if reader.part is not None:
+        kept.append(Part(f"{reader.part.recording[:64]}-{name}", reader.part.part).attachment())
     return atomic_log(path, msgspec.structs.replace(reader.info, label_set=label_set), attachments=kept)
 
 

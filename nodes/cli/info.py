@@ -25,7 +25,7 @@ from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.box_picture import draw_boxes
 from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
-from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file, refuse_overwriting
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
@@ -93,9 +93,8 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
     stamps: dict[str, list[int]] = {}  # of frames, by camera; seqs likewise
     seqs: dict[str, list[int]] = {}
     with open_log(paths, allow_empty=True) as log:
-        logs = log.logs if isinstance(log, LogSequence) else [log]
-        files = [part.path for part in logs]
-        part = None if len(logs) > 1 else read_part(logs[0])
+        files = log.paths
+        part = None if len(files) > 1 else log.part
         for envelope, parts in log.messages():
             topic = f"{envelope.topic}/{envelope.source}" if envelope.topic != "info" else "info"
             topics[topic] += 1

@@ -30,7 +30,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.blocks import KEY_LIMIT
 from semantic_mapper.mapping.refine import surface_voxels, up_frame
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.log.sequence import LogSequence, open_log
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.types import Float64, PosedFrame
 
 ROOM_FRAMES = 32
@@ -154,8 +154,7 @@ def _file_digest(path: Path) -> str:
 def _log_digest(log: Path) -> str:
     """Of the content of a log, whatever its name; of several parts, of all."""
     with open_log(log, allow_empty=True) as reader:
-        parts = reader.logs if isinstance(reader, LogSequence) else [reader]
-        digests = [_file_digest(part.path) for part in parts]
+        digests = [_file_digest(path) for path in reader.paths]
     return digests[0] if len(digests) == 1 else _digest_of({"parts": digests})
 
 
