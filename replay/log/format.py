@@ -14,7 +14,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import IO, NamedTuple, cast
 
 import msgspec
@@ -41,10 +40,9 @@ class AtomicFile:
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         if overwrite and path.is_symlink():
             path.unlink()  # replaced, never written through
-        self._fd = open_unlinked(path, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL))
+        self.fd = open_unlinked(path, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL))
         self._pending = bytearray()
         self.size = 0  # of what was committed, bytes
-        self.closed = False
 
     def write(self, data: bytes) -> int:
         """Collect; never fails."""
@@ -55,9 +53,6 @@ class AtomicFile:
         """Where the next byte will be once all is committed."""
         return self.size + len(self._pending)
 
-    def flush(self) -> None:
-        """Do nothing: ``commit`` decides what is in the file."""
-
     def commit(self) -> None:
         """Bring what was collected to the file.
 
@@ -67,23 +62,13 @@ class AtomicFile:
         written = 0
         try:
             while written < len(data):
-                written += os.write(self._fd, data[written:])
+                written += os.write(self.fd, data[written:])
         except OSError:
             with contextlib.suppress(OSError):  # a device; else a cut record at the end, which readers pass over
-                os.ftruncate(self._fd, self.size)
-                os.lseek(self._fd, self.size, os.SEEK_SET)
+                os.ftruncate(self.fd, self.size)
+                os.lseek(self.fd, self.size, os.SEEK_SET)
             raise
         self.size += written
-
-    def sync(self) -> None:
-        """Wait until the disk has it. Raises OSError: it cannot."""
-        os.fsync(self._fd)
-
-    def close(self) -> None:
-        """Close it as it is. Harmless when repeated."""
-        if not self.closed:
-            self.closed = True
-            os.close(self._fd)
 
 
 PROFILE = "semantic-mapper"
@@ -101,9 +86,7 @@ class LogWriter:
         options: How ``write_frame`` packs; lossless by default.
         overwrite: Whether an existing file may be replaced.
         attachments: What else to keep in it.
-
-    Attributes:
-        trouble: Why it takes nothing more; None where all is well.
+        named: How errors call the file, where it has another name until it is whole.
     """
 
     def __init__(
@@ -114,18 +97,20 @@ class LogWriter:
         options: CodecOptions = _DEFAULTS,
         overwrite: bool = False,
         attachments: Sequence[LogAttachment] = (),
+        named: Path | None = None,
     ) -> None:
         self.path = path
         self.frames = 0
         self.messages = 0
+        self._named = named or path
         self._options = options
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._last_stamp_ns = 0
+        self._failed = self._closed = False
         parts = encode(info)  # before the file is made: what cannot be packed leaves none behind
-        self._failed = False
-        self.trouble: OSError | None = None
-        self._file = _create(path, overwrite)
+        with self._explained():
+            self._file = AtomicFile(path, overwrite=overwrite)
         # A chunk is closed once it is longer than chunk_size, that is after each message.
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=1, compression=CompressionType.NONE)
         try:
@@ -134,11 +119,11 @@ class LogWriter:
             for attachment in attachments:
                 self.attach(attachment)
             self.write_parts(parts)
-        except LogError as error:
-            self._file.close()
+        except LogError:
+            os.close(self._file.fd)
             if path.is_file():
                 path.unlink()
-            raise LogError(f"{path}: cannot be written: {self.trouble or error}") from self.trouble
+            raise
 
     @property
     def bytes_written(self) -> int:
@@ -150,15 +135,12 @@ class LogWriter:
         self._writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
 
     def flush(self) -> None:
-        """Bring attachments to the file that no message has followed.
+        """Bring to the file what no message has followed.
 
         Raises LogError: the disk is full or gone; the log is as it was, and takes nothing more.
         """
-        try:
+        with self._explained():
             self._file.commit()
-        except OSError as error:
-            self._failed = True
-            raise self._cannot_write(error) from error
 
     def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
         """Append one frame.
@@ -178,7 +160,7 @@ class LogWriter:
         as it was, and takes nothing more.
         """
         if self._failed:
-            raise LogError(f"{self.path}: is closed to further messages since one could not be written")
+            raise LogError(f"{self._named}: takes nothing more since a message could not be written")
         envelope = read_envelope(parts)
         stamp = envelope.stamp_ns or self._last_stamp_ns
         self._writer.add_message(
@@ -188,11 +170,7 @@ class LogWriter:
             sequence=envelope.seq & 0xFFFFFFFF,
             data=pack_parts(parts),
         )
-        try:
-            self._file.commit()
-        except OSError as error:
-            self._failed = True  # the index in memory tells of a message that is not there
-            raise self._cannot_write(error) from error
+        self.flush()
         self._last_stamp_ns = stamp
         self.messages += 1
         self.frames += envelope.topic == "frame"
@@ -203,30 +181,26 @@ class LogWriter:
         Where there is no room for the index, the log ends without one: it is whole, and slower to search. Raises
         LogError: the disk is full to the last byte, or gone; what was written can be read.
         """
-        if self._file.closed:
+        if self._closed:
             return
+        self._closed = True
         try:
-            try:
-                if not self._failed:
-                    self._writer.finish()
+            if not self._failed:
+                self._writer.finish()
+                with contextlib.suppress(LogError):  # no room for the index
+                    self.flush()
+            with self._explained():
+                if self._failed:
+                    self._file.write(_short_end())
                     self._file.commit()
-            except OSError:  # no room for the index
-                self._failed = True
-            if self._failed:
-                self._file.write(_short_end())
-                self._file.commit()
-            self._file.sync()
-        except OSError as error:
-            raise self._cannot_write(error) from error
+                os.fsync(self._file.fd)
         finally:
-            self._file.close()
+            os.close(self._file.fd)
 
     def __enter__(self) -> LogWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def _channel(self, topic: str, source: str) -> int:
@@ -240,18 +214,15 @@ class LogWriter:
             self._channels[name] = self._writer.register_channel(name, "msgpack", self._schemas[topic])
         return self._channels[name]
 
-    def _cannot_write(self, error: OSError) -> LogError:
-        self.trouble = error
-        return LogError(f"{self.path}: cannot be written ({error}); {self.frames} frames are in it and can be read")
-
-
-def _create(path: Path, overwrite: bool) -> AtomicFile:
-    try:
-        return AtomicFile(path, overwrite=overwrite)
-    except FileExistsError as error:
-        raise LogError(f"{path}: exists already; remove it or choose another name") from error
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error}") from error
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except FileExistsError as error:
+            raise LogError(f"{self._named}: exists already; remove it or choose another name") from error
+        except OSError as error:
+            self._failed = True  # the index in memory tells of what is not in the file
+            raise LogError(f"{self._named}: cannot be written: {error.strerror or error}") from error
 
 
 def _short_end() -> bytes:
@@ -290,26 +261,11 @@ def atomic_log(
     """
     if path.exists() and not overwrite:
         raise LogError(f"{path}: exists already; remove it or choose another name")
-    writer: LogWriter | None = None
-    try:
-        with atomic_path(path) as unfinished:
-            writer = LogWriter(unfinished, info, options=options, attachments=attachments, overwrite=True)
-            with writer:
-                yield writer
-    except OSError as error:
-        raise _nothing_left(path, error) from error
-    except LogError as error:
-        reason = error.__cause__ if writer is None else writer.trouble
-        if not isinstance(reason, OSError):  # of a log that is read meanwhile
-            raise
-        raise _nothing_left(path, reason) from error
-
-
-def _nothing_left(path: Path, error: OSError) -> LogError:
-    return LogError(
-        f"{path}: cannot be written ({error.strerror or error}), and nothing of it was left; make room, "
-        "or choose another place"
-    )
+    with (
+        atomic_path(path, raises=LogError) as unfinished,
+        LogWriter(unfinished, info, options=options, attachments=attachments, overwrite=True, named=path) as writer,
+    ):
+        yield writer
 
 
 class RecoverReport(NamedTuple):

@@ -89,95 +89,70 @@ def play(
         metadata["played_from_stamp_ns"] = str(options.from_stamp_ns)
     info = msgspec.structs.replace(log.info, frame_count=total, metadata=metadata)
     publisher.publish(encode(info, sender=options.source))
-    run = _Run(log, publisher, acks, options, stop)
+    known = len(log.errors)  # stretches in which no frame can be made out
+    undecodable: list[LogError] = []
+    published = 0
     reason, detail = "error", "the player failed"
     try:
-        for envelope in run.frames(total):
+        for envelope, parts in _due_frames(log, options, stop):
+            try:  # a subscriber would drop what it cannot decode, and lockstep would wait for its answer for ever
+                decode_as(PosedFrame, parts)
+            except CodecError as error:
+                undecodable.append(LogError(f"{log.path}: frame seq={envelope.seq}: {error}"))
+                continue
+            publisher.publish(parts, options.ack_timeout_s)
+            if options.mode == "lockstep" and acks is not None:
+                _wait_for_answer(envelope, publisher, acks, options.ack_timeout_s, stop)
+            published += 1
             on_frame(envelope)
+            if published == total:
+                break
         reason, detail = ("stopped" if stop.is_set() else "end"), ""
     except NodeError as error:
         detail = str(error)
         raise
     finally:
-        end = EndOfStream(options.source, reason, run.published, detail, run.damages, len(run.unreadable))
+        unreadable = [*log.errors[known:], *undecodable]
+        damages = tuple(str(error) for error in (*unreadable, *log.errors[:known]))
+        end = EndOfStream(options.source, reason, published, detail, damages, len(unreadable))
         try:
             publisher.publish(encode(end), STOP_TIMEOUT_S if stop.is_set() else END_TIMEOUT_S)
         except TransportError as error:  # who does not listen any more needs no end; what led here must not be hidden
             logger.warning("end_of_stream_not_delivered", error=str(error))
-    return PlayReport(run.published, tuple(log.errors + run.errors), stop.is_set())
+    return PlayReport(published, tuple(log.errors + undecodable), stop.is_set())
 
 
-class _Run:
-    """One playing: what was sent, and what could not be."""
+def _due_frames(log: Log, options: PlayOptions, stop: threading.Event) -> Iterator[tuple[Envelope, list[bytes]]]:
+    """Frames when they are to be sent, until ``stop``."""
+    began: tuple[float, int] | None = None  # clock and stamp at the first frame
+    for envelope, parts in log.frame_parts():
+        if envelope.stamp_ns < options.from_stamp_ns:
+            continue
+        if options.mode == "realtime":  # keep the distances in time of the recording
+            began = began or (time.monotonic(), envelope.stamp_ns)
+            due = began[0] + (envelope.stamp_ns - began[1]) / 1e9 / options.rate
+            stop.wait(max(0.0, due - time.monotonic()))
+        if stop.is_set():
+            return
+        yield envelope, parts
 
-    def __init__(
-        self,
-        log: Log,
-        publisher: Publisher,
-        acks: LosslessSubscriber | None,
-        options: PlayOptions,
-        stop: threading.Event,
-    ) -> None:
-        self._log, self._publisher, self._acks, self._options, self._stop = log, publisher, acks, options, stop
-        self._known = {str(error) for error in log.errors}  # stretches in which no frame can be made out
-        self._began: tuple[float, int] | None = None  # clock and stamp at the first frame
-        self.published = 0
-        self.errors: list[LogError] = []
 
-    def frames(self, total: int) -> Iterator[Envelope]:
-        """Send frame after frame."""
-        for envelope, parts in self._log.frame_parts():
-            if envelope.stamp_ns < self._options.from_stamp_ns:
-                continue
-            if self.published >= total:
+def _wait_for_answer(
+    envelope: Envelope, publisher: Publisher, acks: LosslessSubscriber, timeout_s: float, stop: threading.Event
+) -> None:
+    """Raises NodeError: the mapper has gone, or does not answer."""
+    deadline = time.monotonic() + timeout_s
+    where = f"frame seq={envelope.seq} of camera '{envelope.source}'"
+    while not stop.is_set():
+        answer = acks.receive(_SLICE_S)
+        if answer is not None:
+            sent = envelope.source, envelope.seq
+            if isinstance(answer, MapUpdate | FrameRefused) and (answer.camera_id, answer.seq) == sent:
                 return
-            if self._options.mode == "realtime":
-                self._wait_for(envelope.stamp_ns)
-            if self._stop.is_set():
-                return
-            try:  # a subscriber would drop what it cannot decode, and lockstep would wait for its answer for ever
-                decode_as(PosedFrame, parts)
-            except CodecError as error:
-                self.errors.append(LogError(f"{self._log.path}: frame seq={envelope.seq}: {error}"))
-                continue
-            self._publisher.publish(parts, self._options.ack_timeout_s)
-            if self._options.mode == "lockstep":
-                self._wait_for_answer(envelope)
-            self.published += 1
-            yield envelope
-
-    @property
-    def unreadable(self) -> list[str]:
-        """Frames that were left out so far."""
-        found = [str(error) for error in (*self._log.errors, *self.errors)]
-        return [text for text in found if text not in self._known]
-
-    @property
-    def damages(self) -> tuple[str, ...]:
-        """What could not be read so far: frames first."""
-        return (*self.unreadable, *(text for error in self._log.errors if (text := str(error)) in self._known))
-
-    def _wait_for(self, stamp_ns: int) -> None:
-        """Keep the distances in time of the recording."""
-        began, first_ns = self._began = self._began or (time.monotonic(), stamp_ns)
-        due = began + (stamp_ns - first_ns) / 1e9 / self._options.rate
-        self._stop.wait(max(0.0, due - time.monotonic()))
-
-    def _wait_for_answer(self, envelope: Envelope) -> None:
-        assert self._acks is not None
-        deadline = time.monotonic() + self._options.ack_timeout_s
-        where = f"frame seq={envelope.seq} of camera '{envelope.source}'"
-        while not self._stop.is_set():
-            answer = self._acks.receive(_SLICE_S)
-            if answer is not None:
-                sent = envelope.source, envelope.seq
-                if isinstance(answer, MapUpdate | FrameRefused) and (answer.camera_id, answer.seq) == sent:
-                    return
-                continue
-            if self._acks.connections() == 0 or self._publisher.subscribers("frame", envelope.source) == 0:
-                raise NodeError(f"the mapper has gone while it worked on {where}; its log says why")
-            if time.monotonic() > deadline:
-                raise NodeError(
-                    f"the mapper has not answered {where} within {self._options.ack_timeout_s:g} s; is it busy with "
-                    "something else, or does it publish its answers at another endpoint?"
-                )
+        elif acks.connections() == 0 or publisher.subscribers("frame", envelope.source) == 0:
+            raise NodeError(f"the mapper has gone while it worked on {where}; its log says why")
+        elif time.monotonic() > deadline:
+            raise NodeError(
+                f"the mapper has not answered {where} within {timeout_s:g} s; is it busy with something else, or does "
+                "it publish its answers at another endpoint?"
+            )

@@ -6,7 +6,7 @@ import errno
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,8 +14,8 @@ from typing import Literal
 from semantic_mapper.errors import LogError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.format import LogWriter
-from semantic_mapper.replay.log.reader import LogAttachment, LogReader
-from semantic_mapper.replay.log.sequence import Part, part_path, parts_on_disk, read_part
+from semantic_mapper.replay.log.reader import LogAttachment, LogReader, Part
+from semantic_mapper.replay.log.sequence import part_path, parts_on_disk
 from semantic_mapper.transport.messages import Parts, StreamInfo
 
 DiskFull = Literal["stop", "delete-oldest"]
@@ -38,16 +38,6 @@ class RecordingRules:
     disk_full: DiskFull = "stop"
     reserve_bytes: int = 0  # so much of the disk is left free for others
 
-    @property
-    def splits(self) -> bool:
-        """Whether there may be more parts than one."""
-        return bool(self.split_bytes or self.split_s)
-
-
-def free_bytes(folder: Path) -> int:
-    """What may still be written to the disk of a folder."""
-    return shutil.disk_usage(folder).free
-
 
 class Recording:
     """Writes messages to the parts of a recording.
@@ -62,8 +52,6 @@ class Recording:
         overwrite: Replace a recording that is there, its numbered parts included.
         goes_on: A recording was interrupted: go on in the part after the last one that is there. Of the parts that are
             there, those of the same ``recording`` may be deleted.
-        clock: Seconds, for ``split_s``.
-        free: Bytes that are free on the disk of a folder.
 
     Attributes:
         messages, frames: Written, in all parts.
@@ -84,16 +72,12 @@ class Recording:
         attachments: Sequence[LogAttachment] = (),
         overwrite: bool = False,
         goes_on: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-        free: Callable[[Path], int] = free_bytes,
     ) -> None:
         self._path = path
         self._info = info
         self._rules = rules
         self._recording = recording
         self._attachments = tuple(attachments)
-        self._clock = clock
-        self._free = free
         self._number = 0
         self._others: list[Parts] = []  # what further streams are
         self._finished: deque[Path] = deque()  # parts that may be deleted, the oldest first
@@ -108,7 +92,7 @@ class Recording:
             self._finished.extend(file for file in there.values() if _is_of(file, recording))
         else:
             make_way(path, overwrite=overwrite)
-        self._began = clock()
+        self._began = time.monotonic()
         self._part: LogWriter | None = self._open(self._number)
 
     @property
@@ -141,18 +125,24 @@ class Recording:
 
         Raises CodecError: not a message of ours; the recording is as it was.
         """
-        size = sum(len(part) for part in parts)
-        if self.ended or self._clock() < self._retry_at or not self._make_room(size):
+        if self.ended or time.monotonic() < self._retry_at:
             self.lost += 1
             return
-        if self._part is not None and self._is_due(self._part, size):
-            self._finish_part()
-        try:
-            if self._part is None:
-                self._begin_part()
-            self._write(parts)
-        except LogError as error:
-            self._on_failure(parts, error)
+        while True:
+            try:
+                self._check_reserve(parts)
+                self._write(parts)
+                return
+            except OSError as error:
+                reason = error
+            except LogError as error:  # the disk took no more, whatever it had promised
+                self._drop_failed_part()
+                reason = error.__cause__
+            is_full = isinstance(reason, OSError) and reason.errno in _NO_ROOM
+            if not is_full or not self._delete_oldest():
+                self.lost += 1
+                self._stop(str(reason.strerror if isinstance(reason, OSError) else reason))
+                return
 
     def announce(self, info: Parts, attachment: LogAttachment) -> None:
         """Append what a further stream is; like the first one's it stands in each part that begins from now on.
@@ -174,8 +164,23 @@ class Recording:
         self._finish_part()
         self.ended = True
 
+    def _check_reserve(self, parts: Parts) -> None:
+        """Raises OSError: a message does not fit next to the reserve, or the disk is gone."""
+        free, reserve = shutil.disk_usage(self._path.parent).free, self._rules.reserve_bytes
+        if free - _size(parts) < reserve:
+            room = f"{free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are left to others"
+            raise OSError(errno.ENOSPC, f"the disk is full: {room}")
+
     def _write(self, parts: Parts) -> None:
-        assert self._part is not None
+        if self._part is not None and self._is_due(self._part, _size(parts)):
+            self._finish_part()
+        if self._part is None:
+            self._part = self._open(self._number + 1)
+            self._number += 1
+            self._began = time.monotonic()
+            for info in self._others:
+                self._part.write_parts(info)
+            _log.info("part_begun", log=str(self.path))
         self._part.write_parts(parts)
         self.trouble = ""
 
@@ -184,16 +189,7 @@ class Recording:
         if not self._holds_anything(part):
             return False
         too_large = rules.split_bytes and part.bytes_written + size > rules.split_bytes
-        return bool(too_large) or bool(rules.split_s and self._clock() - self._began >= rules.split_s)
-
-    def _begin_part(self) -> None:
-        """Open the next part."""
-        self._part = self._open(self._number + 1)
-        self._number += 1
-        self._began = self._clock()
-        for info in self._others:
-            self._part.write_parts(info)
-        _log.info("part_begun", log=str(self.path))
+        return bool(too_large) or bool(rules.split_s and time.monotonic() - self._began >= rules.split_s)
 
     def _holds_anything(self, part: LogWriter) -> bool:
         """More than what the streams are."""
@@ -218,21 +214,6 @@ class Recording:
         except LogError as error:  # its messages are whole
             _log.warning("part_not_closed", log=str(part.path), error=str(error))
 
-    def _make_room(self, size: int) -> bool:
-        """Whether a message fits next to the reserve; deletes parts for it where that is the rule."""
-        reserve = self._rules.reserve_bytes
-        try:
-            while (free := self._free(self._path.parent)) - size < reserve:
-                if not self._delete_oldest():
-                    self._stop(
-                        f"the disk is full: {free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are left to others"
-                    )
-                    return False
-        except OSError as error:  # unmounted, or a folder that somebody has removed
-            self._stop(f"the free space of the disk cannot be read: {error}")
-            return False
-        return True
-
     def _delete_oldest(self) -> bool:
         """False where nothing may be deleted: not the newest part that holds anything."""
         newest = 0 if self._part is not None and self._holds_anything(self._part) else 1
@@ -243,20 +224,6 @@ class Recording:
         self.deleted += 1
         _log.warning("part_deleted", log=str(oldest), reason="the disk is full")
         return True
-
-    def _on_failure(self, message: Parts, error: LogError) -> None:
-        """The disk took no more, whatever it had promised: go on in a new part, if the rules can make room for one."""
-        self._drop_failed_part()
-        while isinstance(error.__cause__, OSError) and error.__cause__.errno in _NO_ROOM and self._delete_oldest():
-            try:
-                self._begin_part()
-                return self._write(message)
-            except LogError as again:
-                error = again
-                self._drop_failed_part()
-        self.lost += 1
-        self._stop(str(error))
-        return None
 
     def _drop_failed_part(self) -> None:
         """Finish a part that can take no more; one that holds nothing is removed."""
@@ -276,19 +243,22 @@ class Recording:
             what = "recording has stopped; " + ("its file is gone" if self.gone else "what is recorded is whole")
         else:
             what = "no older part is left to delete; recording goes on once there is room"
-        self._retry_at = self._clock() + RETRY_S
+        self._retry_at = time.monotonic() + RETRY_S
         if not self.trouble:
             _log.error("recording_stopped", log=str(self.path), reason=why, then=what)
-        self.trouble = f"{self.path}: {why}; {what}"
+        self.trouble = f"{self.path}: cannot be written: {why}; {what}"
 
 
 def _is_of(file: Path, recording: str) -> bool:
     try:
         with LogReader(file, allow_empty=True) as log:
-            part = read_part(log)
+            return log.part is not None and log.part.recording == recording
     except LogError:
         return False
-    return part is not None and part.recording == recording
+
+
+def _size(parts: Parts) -> int:
+    return sum(len(part) for part in parts)
 
 
 def make_way(path: Path, *, overwrite: bool, dry: bool = False) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import random
 import signal
 import subprocess
@@ -16,7 +15,6 @@ import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter, recover
 from semantic_mapper.transport.codec import encode, encode_frame, pack_parts
 from semantic_mapper.transport.messages import StreamInfo
@@ -78,8 +76,14 @@ def test_any_frame_can_be_read_in_any_order_and_from_any_thread(small_log: Path)
         assert found == [list(range(FRAMES))] * 4
 
 
-def test_a_log_may_hold_other_messages_beside_frames(tmp_path: Path) -> None:
+def test_a_log_may_hold_other_messages_beside_frames_and_no_frames_only_where_allowed(tmp_path: Path) -> None:
     path = tmp_path / "mixed.mcap"
+    LogWriter(path, StreamInfo("empty")).close()
+    with pytest.raises(LogError, match="holds no frames"):
+        LogReader(path)
+    with LogReader(path, allow_empty=True) as reader:
+        assert len(reader) == 0 and reader.info.source == "empty"
+    path.unlink()
     with LogWriter(path, StreamInfo("test")) as writer:
         for seq in range(3):
             writer.write_frame(samples.make_frame(seq))
@@ -90,14 +94,10 @@ def test_a_log_may_hold_other_messages_beside_frames(tmp_path: Path) -> None:
         assert [e.topic for e, _ in reader.messages()] == ["info"] + ["frame", "status"] * 3
 
 
-def test_a_full_disk_is_a_clear_error() -> None:
-    if not Path("/dev/full").exists():
-        pytest.skip("this system has no /dev/full")
-    with pytest.raises(LogError, match="cannot be written"):
-        LogWriter(Path("/dev/full"), StreamInfo("test"), overwrite=True)
-
-
-@pytest.mark.parametrize("content", [b"", b"\x89", b"not a log at all, just some text", b"\x89MCAP0\r\n", bytes(5000)])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\x89", b"not a log at all, just some text", b"\x89MCAP0\r\n", bytes(5000), b"PK\x03\x04" + bytes(9)],
+)
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
@@ -105,25 +105,25 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> Non
         LogReader(path)
 
 
-def test_a_foreign_mcap_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "foreign.mcap"
+def write_foreign(path: Path, payloads: dict[str, bytes], **how) -> None:
     with path.open("wb") as file:
-        writer = mcap.writer.Writer(file)
+        writer = mcap.writer.Writer(file, **how)
         writer.start()
-        channel = writer.register_channel("/odometry", "json", writer.register_schema("o", "jsonschema", b"{}"))
-        writer.add_message(channel, 1, b"{}", 1)
+        channel = writer.register_channel("any", "json", writer.register_schema("o", "jsonschema", b"{}"))
+        for payload in payloads.values():
+            writer.add_message(channel, 1, payload, 1)
         writer.finish()
+
+
+def test_a_foreign_mcap_is_refused_and_a_log_without_chunks_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.mcap"
+    write_foreign(path, {"odometry": b"{}"})
     with pytest.raises(LogError, match="not a log of semantic-mapper"):
         LogReader(path)
-
-
-def test_a_log_without_frames_is_refused_unless_asked_for(tmp_path: Path) -> None:
-    path = tmp_path / "empty.mcap"
-    LogWriter(path, StreamInfo("test")).close()
-    with pytest.raises(LogError, match="holds no frames"):
-        LogReader(path)
-    with LogReader(path, allow_empty=True) as reader:
-        assert len(reader) == 0 and reader.info.source == "test"
+    messages = samples.all_messages()
+    write_foreign(path, {name: pack_parts(messages[name]) for name in ("info", "frame")}, use_chunking=False)
+    with LogReader(path) as reader:
+        assert len(reader) == 1 and seqs(reader) == [3]
 
 
 @pytest.mark.slow
@@ -220,19 +220,6 @@ def test_a_log_that_another_tool_rewrote_is_read(small_log: Path, tmp_path: Path
         assert seqs(again) == list(range(FRAMES)) and not again.errors
 
 
-def test_a_log_without_chunks_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "plain.mcap"
-    with path.open("wb") as file:
-        writer = mcap.writer.Writer(file, use_chunking=False)
-        writer.start()
-        channel = writer.register_channel("any", "msgpack", 0)
-        for parts in (samples.all_messages()["info"], samples.all_messages()["frame"]):
-            writer.add_message(channel, 1, pack_parts(parts), 1)
-        writer.finish()
-    with LogReader(path) as reader:
-        assert len(reader) == 1 and seqs(reader) == [3]
-
-
 def test_recover_writes_a_clean_log_of_what_is_whole(small_log: Path, tmp_path: Path) -> None:
     chunks = chunk_starts(small_log)
     data = bytearray(small_log.read_bytes())[: chunks[10][0] + 50]  # frames 0 to 8 are whole
@@ -263,7 +250,7 @@ with LogWriter(Path(sys.argv[1]), StreamInfo("killed")) as writer:
 """
 
 
-@pytest.mark.parametrize("frames", [1, 20, 57])
+@pytest.mark.parametrize("frames", [1, 20])
 def test_a_killed_writer_loses_at_most_the_message_it_was_writing(tmp_path: Path, frames: int) -> None:
     path = tmp_path / "killed.mcap"
     root = Path(__file__).parents[3]
@@ -281,33 +268,3 @@ def test_a_killed_writer_loses_at_most_the_message_it_was_writing(tmp_path: Path
         assert not reader.finished
     assert found[: last + 1] == list(range(last + 1))  # all that was said to be written
     assert len(found) <= last + 2
-
-
-@pytest.mark.parametrize(
-    ("start", "says"), [(b"PK\x03\x04", "a ZIP file, as saved maps are"), (b"#ROSBAG V2.0\n", "a ROS 1 bag")]
-)
-def test_a_file_of_another_kind_is_named(tmp_path: Path, start: bytes, says: str) -> None:
-    path = tmp_path / "file.mcap"
-    path.write_bytes(start + bytes(100))
-    with pytest.raises(LogError, match=f"not an MCAP log \\(it is {says}\\)"):
-        LogReader(path)
-
-
-def test_a_frame_whose_intrinsics_do_not_fit_is_reported_as_damaged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "wild.mcap"
-    with (
-        monkeypatch.context() as patch,
-        LogWriter(path, StreamInfo("test", {samples.CAMERA: samples.INTRINSICS})) as log,
-    ):
-        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as another program may write them
-        wild = dataclasses.replace(samples.INTRINSICS, cy=1e19)
-        for seq in range(3):
-            frame = samples.make_frame(seq)
-            log.write_frame(dataclasses.replace(frame, intrinsics=wild) if seq == 1 else frame)
-    found = describe_log([path], lambda: None)
-    assert found["frames"] == 2 and len(found["damage"]) == 1
-    assert "frame 1" in found["damage"][0] and "cy=1e+19" in found["damage"][0]
-    with LogReader(path) as reader:
-        assert seqs(reader) == [0, 2]

@@ -12,16 +12,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from resource import RLIMIT_FSIZE, getrlimit, setrlimit
+from types import SimpleNamespace
 
 import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter, recover
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
-from semantic_mapper.replay.log.sequence import LogSequence, open_log, parts_on_disk
+from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
+from tests.replay import recordings as rec
 from tests.transport import samples
 
 INFO = StreamInfo("test", {samples.CAMERA: samples.INTRINSICS}, NYU40)
@@ -66,8 +69,21 @@ class Disk:
         return self._write(fd, bytes(data)[:room])
 
 
-def plenty(folder: Path) -> int:
-    return 1 << 40
+class World:
+    """What the recording believes of the disk and the clock."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.free: Callable[[Path], int] = lambda folder: 1 << 40
+        module = "semantic_mapper.replay.log.recording"
+        usage = SimpleNamespace(disk_usage=lambda folder: SimpleNamespace(free=self.free(folder)))
+        monkeypatch.setattr(f"{module}.shutil", usage)
+        monkeypatch.setattr(f"{module}.time", SimpleNamespace(monotonic=lambda: self.now))
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    return World(monkeypatch)
 
 
 @contextmanager
@@ -92,7 +108,7 @@ def test_parts_by_size_are_logs_by_themselves_and_one_together(tmp_path: Path) -
     shuffled = sorted(files.values(), key=lambda file: file.name[::-1])
     assert frames_in(*shuffled) == frames_in(tmp_path) == list(range(40))
     with open_log(shuffled) as log:
-        assert isinstance(log, LogSequence) and log.finished and not log.notices and len(log) == 40
+        assert log.finished and not log.notices and len(log) == 40 and log.paths == list(files.values())
         assert [log.frame(n).seq for n in (39, 0, 17, 8)] == [39, 0, 17, 8]
         assert [e.seq for e, _ in log.frame_parts()] == list(range(40))
         assert [item.seq for item in log.frames_or_errors(11)] == list(range(11))  # type: ignore[union-attr]
@@ -123,12 +139,11 @@ def test_each_part_says_what_all_streams_are(tmp_path: Path) -> None:
             assert not log.errors
 
 
-def test_parts_by_time(tmp_path: Path) -> None:
-    now = 100.0
-    timed = recording(tmp_path / "a.mcap", RecordingRules(split_s=2), clock=lambda: now)
+def test_parts_by_time(tmp_path: Path, world: World) -> None:
+    timed = recording(tmp_path / "a.mcap", RecordingRules(split_s=2))
     for seq in range(10):
         write(timed, range(seq, seq + 1))
-        now += 0.75
+        world.now += 0.75
     timed.close()
     assert [frames_in(f) for f in parts_on_disk(tmp_path / "a.mcap").values()] == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9]]
 
@@ -156,15 +171,14 @@ def test_parts_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
         assert "is part 1: what was recorded before" in log.notices[0] and "1 parts of the recording" in log.notices[1]
 
 
-def test_full_disk_stops_the_recording_with_all_that_was_written(tmp_path: Path) -> None:
-    free = 10 * FRAME_BYTES
-    stopped = recording(tmp_path / "a.mcap", RecordingRules(reserve_bytes=5_000), free=lambda folder: free)
+def test_full_disk_stops_the_recording_with_all_that_was_written(tmp_path: Path, world: World) -> None:
+    stopped = recording(tmp_path / "a.mcap", RecordingRules(reserve_bytes=5_000))
     for seq in range(20):
+        world.free = lambda folder, seq=seq: (10 - seq) * FRAME_BYTES
         write(stopped, range(seq, seq + 1))
-        free -= FRAME_BYTES
     assert stopped.ended and stopped.frames + stopped.lost == 20 and stopped.frames >= 5
     assert "recording has stopped" in stopped.trouble and "the disk is full" in stopped.trouble
-    free = 1 << 40
+    world.free = lambda folder: 1 << 40
     write(stopped, range(20, 22))  # stopped is stopped
     assert stopped.lost == 22 - stopped.frames
     with LogReader(tmp_path / "a.mcap") as log:
@@ -172,7 +186,7 @@ def test_full_disk_stops_the_recording_with_all_that_was_written(tmp_path: Path)
     stopped.close()
 
 
-def test_ring_keeps_the_newest_and_the_reserve(tmp_path: Path) -> None:
+def test_ring_keeps_the_newest_and_the_reserve(tmp_path: Path, world: World) -> None:
     size, reserve = 200_000, 30_000
     left: list[int] = []
 
@@ -180,8 +194,8 @@ def test_ring_keeps_the_newest_and_the_reserve(tmp_path: Path) -> None:
         left.append(size - sum(file.stat().st_size for file in folder.iterdir()))
         return left[-1]
 
-    rules = RecordingRules(split_bytes=30_000, disk_full="delete-oldest", reserve_bytes=reserve)
-    ring = recording(tmp_path / "a.mcap", rules, free=free)
+    world.free = free
+    ring = recording(tmp_path / "a.mcap", RecordingRules(30_000, disk_full="delete-oldest", reserve_bytes=reserve))
     write(ring, range(60))
     ring.close()
     found = frames_in(tmp_path)
@@ -192,37 +206,39 @@ def test_ring_keeps_the_newest_and_the_reserve(tmp_path: Path) -> None:
         assert "what was recorded before is not here" in log.notices[0]
 
 
-def test_recording_pauses_where_nothing_is_left_to_delete_and_goes_on(tmp_path: Path) -> None:
-    free, now = 1 << 30, 0.0
-    rules = RecordingRules(split_bytes=1 << 20, disk_full="delete-oldest", reserve_bytes=1000)
-    pausing = recording(tmp_path / "a.mcap", rules, free=lambda folder: free, clock=lambda: now)
+def test_recording_pauses_where_nothing_is_left_to_delete_and_goes_on(tmp_path: Path, world: World) -> None:
+    pausing = recording(tmp_path / "a.mcap", RecordingRules(1 << 20, disk_full="delete-oldest", reserve_bytes=1000))
     write(pausing, range(3))
-    free = 1500
+    world.free = lambda folder: 1500
     write(pausing, range(3, 6))
     assert pausing.lost == 3 and not pausing.ended and "goes on once there is room" in pausing.trouble
-    free, now = 1 << 30, 5.0
+    world.free, world.now = lambda folder: 1 << 30, 105.0
     write(pausing, range(6, 8))
     assert not pausing.trouble
     pausing.close()
     assert frames_in(tmp_path) == [0, 1, 2, 6, 7]
 
 
-def test_disk_that_goes_away_is_reported(tmp_path: Path) -> None:
+@pytest.mark.parametrize("remove", [shutil.rmtree, lambda folder: (folder / "a.mcap").unlink()], ids=["folder", "file"])
+def test_disk_or_log_that_goes_away_is_reported(tmp_path: Path, remove: Callable[[Path], None]) -> None:
     (tmp_path / "disk").mkdir()
     gone = recording(tmp_path / "disk" / "a.mcap", RecordingRules())
     write(gone, range(3))
-    shutil.rmtree(tmp_path / "disk")
+    assert not gone.gone
+    remove(tmp_path / "disk")
     write(gone, range(3, 6))
-    assert gone.ended and (gone.frames, gone.lost) == (3, 3) and "cannot be read" in gone.trouble
-    assert gone.nothing_left
+    if gone.ended:
+        assert (gone.frames, gone.lost) == (3, 3) and "No such file" in gone.trouble
+    gone.close()
+    assert gone.gone and gone.nothing_left and "whole" not in gone.trouble
 
 
 @pytest.mark.parametrize("size", range(30_000, 32_600, 433))
 def test_disk_that_takes_half_a_message_damages_nothing(
-    tmp_path: Path, size: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, size: int, monkeypatch: pytest.MonkeyPatch, world: World
 ) -> None:
     Disk(tmp_path, size, monkeypatch)
-    stopped = recording(tmp_path / "a.mcap", RecordingRules(), free=plenty)  # which is not true
+    stopped = recording(tmp_path / "a.mcap", RecordingRules())
     write(stopped, range(30))
     assert stopped.ended and "No space left" in stopped.trouble and stopped.frames + stopped.lost == 30
     stopped.close()
@@ -347,14 +363,24 @@ def test_log_without_room_for_its_index_is_closed_without_one(
         assert reader.finished and len(reader) == 3 and not reader.errors
 
 
-def test_a_log_that_was_removed_is_not_called_whole(tmp_path: Path) -> None:
-    for name, remove in (("folder", shutil.rmtree), ("file", lambda folder: (folder / "a.mcap").unlink())):
-        folder = tmp_path / name
-        folder.mkdir()
-        gone = recording(folder / "a.mcap", RecordingRules())
-        write(gone, range(3))
-        assert not gone.gone
-        remove(folder)
-        write(gone, range(3, 6))
-        gone.close()
-        assert gone.gone and "whole" not in gone.trouble
+@pytest.mark.parametrize("room", [0, 10_000])
+def test_on_a_full_disk_an_import_and_a_recovery_leave_nothing(
+    tmp_path: Path, room: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, log, small = rec.make_folder(tmp_path / "kitchen"), tmp_path / "log.mcap", tmp_path / "small"
+    import_recording(source, log)
+    assert log.stat().st_size > 20_000
+    small.mkdir()
+    disk = Disk(small, room, monkeypatch)
+    for make, of in ((import_recording, source), (recover, log)):
+        with pytest.raises(LogError, match=r"small/new.mcap: cannot be written: No space left on device"):
+            make(of, small / "new.mcap")
+        assert not list(small.iterdir())
+    disk.size += 3
+    (small / "old.mcap").write_bytes(b"old")
+    with pytest.raises(LogError, match="No space left"):
+        import_recording(source, small / "old.mcap", overwrite=True)
+    assert [file.read_bytes() for file in small.iterdir()] == [b"old"]  # until the new one is whole
+    disk.size = 1 << 30
+    recover(log, small / "new.mcap")
+    assert len(frames_in(small / "new.mcap")) == 6
