@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.nodes.support import run, write_config, write_log, write_weights
+from tests.nodes.support import run_ok, write_config, write_log, write_weights
 from tests.small import tiny_frames
 
 
@@ -37,7 +37,6 @@ def config(folder: Path) -> Path:
 def replayed(folder: Path, log: Path, weights: Path, config: Path) -> Path:
     """Results of an in-process replay; its stdout is beside them."""
     out = folder / "replayed"
-    done = run("replay", log, "--out", out, "--weights", weights, "--config", config, "--json")
-    assert done.returncode == 0, done.stderr
+    done = run_ok("replay", log, "--out", out, "--weights", weights, "--config", config, "--json")
     (out / "stdout.txt").write_text(done.stdout, encoding="utf-8")
     return out

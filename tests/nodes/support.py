@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import os
 import re
 import signal
@@ -114,10 +115,29 @@ def run_process(*arguments: str | Path, cwd: Path | None = None) -> subprocess.C
     )
 
 
+def run_ok(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """As ``run``, of what must end well."""
+    done = run(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def refused(*arguments: str | Path, code: int = 1) -> str:
+    """As ``run``, of what must fail: its line of error, or all of what it says about wrong usage."""
+    done = run(*arguments)
+    assert done.returncode == code, done.stdout + done.stderr
+    return " ".join((done.stderr if code == 2 and "Usage:" in done.stderr else error_line(done.stderr)).split())
+
+
 def run_here(*arguments: str | Path) -> tuple[int, str]:
     """As ``run``: exit code, and all that it said on one line."""
     done = run(*arguments)
     return done.returncode, " ".join((done.stdout + done.stderr).split())
+
+
+def summary_of(out: Path) -> dict[str, Any]:
+    """What a run says of itself."""
+    return json.loads((out / "summary.json").read_text())
 
 
 @contextmanager

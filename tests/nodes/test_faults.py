@@ -23,6 +23,7 @@ from tests.nodes.support import (
     is_alive,
     repeated_frames,
     run,
+    run_ok,
     write_log,
 )
 
@@ -155,8 +156,7 @@ def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the
 
 @pytest.mark.slow
 def test_log_that_is_at_its_end_ends_a_live_launch_in_order(log: Path, tmp_path: Path) -> None:
-    done = run("up", alone(tmp_path, log))
-    assert done.returncode == 0, done.stderr
+    done = run_ok("up", alone(tmp_path, log))
     assert done.stderr.count("node_started") == 1 and "node_ended" not in done.stderr
 
 
@@ -190,8 +190,7 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     os.kill(pid, signal.SIGKILL)
     pid = wait_for_start(watched, "eye", 1)
     for _ in range(20):  # the new process first has to publish
-        done = run("view", "--status", sockets, "--once", "--json")
-        assert done.returncode == 0, done.stderr
+        done = run_ok("view", "--status", sockets, "--once", "--json")
         shown = json.loads(done.stdout)
         eye = shown["nodes"]["eye"]
         if eye["counters"].get("published"):

@@ -18,11 +18,12 @@ from semantic_mapper.replay.log.format import LogReader
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,
-    error_line,
     eventually,
     is_alive,
+    refused,
     repeated_frames,
     run,
+    run_ok,
     write_log,
 )
 from tests.small import tiny_frames
@@ -44,8 +45,7 @@ def long_log(folder: Path) -> Path:
 def recorded(folder: Path, log: Path, weights: Path, config: Path) -> Path:
     """Results of all three nodes in lockstep."""
     out = folder / "up"
-    done = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
-    assert done.returncode == 0, done.stderr
+    done = run_ok("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
     assert "frames fused" in done.stdout
     return out
 
@@ -103,8 +103,7 @@ def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
 ) -> None:
     log = write_log(tmp_path / "forty.mcap", repeated_frames(40))
     more = ("--set", f"camera.mode={mode}", "--set", f"mapper.delivery={delivery}")
-    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), *more, "--out", tmp_path / "up")
-    assert done.returncode == 0, done.stderr
+    run_ok("up", REPLAY_LAUNCH, *_settings(log, weights, config), *more, "--out", tmp_path / "up")
     frames = json.loads((tmp_path / "up" / "summary.json").read_text())["frames"]
     assert frames["published"] == 40
     assert frames["fused"] >= 1 and frames["fused"] + frames["dropped"] == 40
@@ -118,8 +117,7 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
     skewed[:3, :3] *= 2
     frames[1] = dataclasses.replace(frames[1], T_world_camera=skewed)
     log = write_log(tmp_path / "skewed.mcap", frames)
-    done = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
-    assert done.returncode == 0, done.stderr
+    done = run_ok("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["frames"]["published"] == 4 and summary["frames"]["fused"] == 3
     assert "frame seq=1" in summary["refusals"][0]["reason"]
@@ -135,8 +133,9 @@ def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
     out = tmp_path / "up"
     assert run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out).returncode == 0
     before = _digests(out)
-    again = run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
-    assert again.returncode == 1 and "recorded.mcap: exists already" in error_line(again.stderr)
+    assert "recorded.mcap: exists already" in refused(
+        "up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out
+    )
     assert _digests(out) == before
 
 
@@ -160,8 +159,7 @@ def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, co
     settings += [f"mapper.weights={weights}", f"mapper.config={rendered}"]
     options = [word for setting in settings for word in ("--set", setting)]
     out = tmp_path / "out"
-    done = run("up", REPLAY_LAUNCH, *options, "--out", out)
-    assert done.returncode == 0, done.stderr
+    run_ok("up", REPLAY_LAUNCH, *options, "--out", out)
     frames = json.loads((out / "summary.json").read_text())["frames"]
     assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)
 

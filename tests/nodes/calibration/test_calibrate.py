@@ -24,7 +24,7 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.calibrating.boards import BOARD, LENS, picture, shown
 from tests.drivers.support import write_film
-from tests.nodes.support import error_line, run, run_here
+from tests.nodes.support import error_line, run, run_here, run_ok
 from tests.replay.log.test_recording import files_at_most
 
 SETTINGS = CalibrationSettings(board=BOARD)
@@ -50,8 +50,7 @@ def test_a_folder_becomes_a_file_that_drivers_read_and_a_picture(pictures: Path,
     config = tmp_path / "board.toml"
     config.write_text(BOARD_FILE)
     out, sheet = tmp_path / "made", tmp_path / "sheet.png"
-    done = run("calibrate", pictures, "--config", config, "--out", out, "--board", sheet, "--json")
-    assert done.returncode == 0, done.stderr
+    done = run_ok("calibrate", pictures, "--config", config, "--out", out, "--board", sheet, "--json")
     told = json.loads(done.stdout)
     read = load_calibration(out / "camera.toml")
     assert abs(read.fx / LENS.fx - 1) < 0.005 and (read.width, read.height) == (640, 480)

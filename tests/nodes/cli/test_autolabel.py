@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,11 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.imaging import is_measured
-from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.labelling import choose_keyframes
 from semantic_mapper.replay.autolabel import AutolabelReport, AutolabelRequest, autolabel_log
-from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.autolabel_note import AutolabelNote, read_note
 from semantic_mapper.replay.exporters import export_log
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.job_monitor import JobMonitor
@@ -31,7 +31,7 @@ from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import Status, StreamInfo
 from semantic_mapper.types import PosedFrame
-from tests.nodes.support import error_line, run, write_log, write_weights
+from tests.nodes.support import refused, run, run_ok, summary_of, write_log, write_weights
 from tests.small import INTRINSICS, tiny_config, tiny_field, tiny_frames
 
 CALIBRATION = LogAttachment("calibration.json", "application/json", b'{"lens": 1}')
@@ -52,14 +52,20 @@ class StopsAfter(JobMonitor):
         self.left -= 1
 
 
-def unlabelled(frames: tuple[PosedFrame, ...], labelled: int = 0) -> list[PosedFrame]:
-    """Frames of which only the first few have labels."""
-    return [f if i < labelled else dataclasses.replace(f, label=None) for i, f in enumerate(frames)]
-
-
 def relabelled(log: Path, out: Path, weights: Path, **options: Any) -> AutolabelReport:
-    request = AutolabelRequest((log,), out, weights, tiny_config(), **options)
-    return autolabel_log(request)
+    return autolabel_log(AutolabelRequest((log,), out, weights, tiny_config(), **options))
+
+
+def read(log: Path) -> tuple[list[PosedFrame], AutolabelNote]:
+    """All frames, and what is noted of their labels."""
+    with LogReader(log) as opened:
+        note = read_note(opened.attachments())
+        assert note is not None and not opened.errors
+        return list(opened), note
+
+
+def same_labels(one: PosedFrame, other: PosedFrame) -> bool:
+    return one.label_is_pseudo == other.label_is_pseudo and np.array_equal(one.label, other.label)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +74,8 @@ def part_labelled(folder: Path) -> Path:
     path = folder / "part-labelled.mcap"
     info = StreamInfo("test room", {"rooms": INTRINSICS}, ROOMS, metadata={"place": "lab"})
     with LogWriter(path, info, attachments=(CALIBRATION,)) as log:
-        for frame in unlabelled(tiny_frames(6), 2):
+        for i, frame in enumerate(tiny_frames(6)):
+            frame = frame if i < 2 else replace(frame, label=None)
             log.write_parts(encode_frame(frame, CodecOptions(rgb="jpeg")))
             log.write_parts(encode(STATUS))
     return path
@@ -78,8 +85,7 @@ def part_labelled(folder: Path) -> Path:
 def new(folder: Path, part_labelled: Path, weights: Path) -> Path:
     """What the verb makes of it; its JSON is beside it."""
     out = folder / "new.mcap"
-    done = run("autolabel", part_labelled, "--weights", weights, "--out", out, "--json")
-    assert done.returncode == 0, done.stderr
+    done = run_ok("autolabel", part_labelled, "--weights", weights, "--out", out, "--json")
     out.with_suffix(".json").write_text(done.stdout)
     return out
 
@@ -99,133 +105,86 @@ def test_all_but_the_labels_stays_byte_for_byte(new: Path, part_labelled: Path) 
                 assert other_parts[2:4] == parts[2:4]  # the very JPEG file, and depth
 
 
-def test_labels_that_are_there_stay_and_others_are_marked(new: Path) -> None:
-    with LogReader(new) as log:
-        frames = list(log)
-        note = read_note(log.attachments())
+def test_labels_that_are_there_stay_and_others_are_those_that_replay_renders(
+    new: Path, part_labelled: Path, weights: Path
+) -> None:
+    frames, note = read(new)
     assert [f.label_is_pseudo for f in frames] == [False, False, True, True, True, True]
-    for frame, given in zip(frames[:2], tiny_frames(6), strict=False):
-        assert frame.label is not None and np.array_equal(frame.label, given.label)
-    assert note is not None and (note.frames, note.labelled, note.kept, note.replaced) == (6, 4, 2, 0)
+    assert (note.frames, note.labelled, note.kept, note.replaced) == (6, 4, 2, 0)
+    mapper = Mapper.load(weights, load_mapper_config(None, defaults=OFFLINE))
+    with LogReader(part_labelled) as log:
+        for frame, other in zip(log, frames, strict=True):
+            rendered = mapper.step(frame).label
+            assert np.array_equal(other.label, rendered if other.label_is_pseudo else frame.label)  # type: ignore[arg-type]
     said = json.loads(new.with_suffix(".json").read_text())
     assert said["labelled"] == 4 and said["files"] == [str(new)] and said["kind"] == "sray"
     assert 0 < said["mean_confidence"] <= 1 and 0 < said["labelled_pixels"] <= 1
-
-
-def test_labels_are_those_that_replay_renders(new: Path, part_labelled: Path, weights: Path) -> None:
-    mapper = Mapper.load(weights, load_mapper_config(None, defaults=OFFLINE))
-    with LogReader(part_labelled) as log, LogReader(new) as labelled:
-        for frame, other in zip(log, labelled, strict=True):
-            update = mapper.step(frame)
-            if other.label_is_pseudo:
-                assert np.array_equal(update.label, other.label)
-
-
-def test_the_same_run_gives_the_same_bytes(part_labelled: Path, weights: Path, tmp_path: Path) -> None:
-    for name in ("a.mcap", "b.mcap"):
-        relabelled(part_labelled, tmp_path / name, weights)
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
-def test_info_says_who_has_labelled_a_log(new: Path) -> None:
-    said = run("info", new).stdout
-    assert "tiny.safetensors (sray, SHA-256" in said and "4 with pseudo labels" in said
-    found = json.loads(run("info", new, "--json").stdout)
-    assert (found["frames_with_labels"], found["frames_with_pseudo_labels"]) == (2, 4)
-    assert found["autolabel"]["labelled"] == 4 and len(found["autolabel"]["digest"]) == 64
+    shown = run("info", new).stdout
+    assert "tiny.safetensors (sray, SHA-256" in shown and "4 with pseudo labels" in shown
+    told = json.loads(run("info", new, "--json").stdout)
+    assert (told["frames_with_labels"], told["frames_with_pseudo_labels"]) == (2, 4)
+    assert told["autolabel"]["labelled"] == 4 and len(told["autolabel"]["digest"]) == 64
 
 
 def test_pixels_that_are_not_sure_are_unknown(part_labelled: Path, weights: Path, tmp_path: Path) -> None:
-    relabelled(part_labelled, tmp_path / "all.mcap", weights)
-    with LogReader(tmp_path / "all.mcap") as log:
-        note = read_note(log.attachments())
-        everything = list(log)[3].label
-    assert note is not None and note.mean_confidence is not None and everything is not None
+    for name in ("all.mcap", "again.mcap"):
+        relabelled(part_labelled, tmp_path / name, weights)
+    assert (tmp_path / "all.mcap").read_bytes() == (tmp_path / "again.mcap").read_bytes()
+    frames, note = read(tmp_path / "all.mcap")
+    assert note.mean_confidence is not None and note.labelled_pixels is not None
     relabelled(part_labelled, tmp_path / "sure.mcap", weights, min_confidence=note.mean_confidence)
-    with LogReader(tmp_path / "sure.mcap") as log:
-        sure = list(log)[3].label
-        kept = read_note(log.attachments())
-    assert sure is not None and kept is not None and kept.mean_confidence is not None
-    unknown = sure == ROOMS.ignore_id
-    assert 0 < unknown.mean() < 1 and np.array_equal(sure[~unknown], everything[~unknown])
-    assert kept.mean_confidence > note.mean_confidence
-    assert kept.labelled_pixels is not None and note.labelled_pixels is not None
-    assert kept.labelled_pixels < note.labelled_pixels
+    sure, kept = read(tmp_path / "sure.mcap")
+    everything, some = frames[3].label, sure[3].label
+    assert everything is not None and some is not None
+    unknown = some == ROOMS.ignore_id
+    assert 0 < unknown.mean() < 1 and np.array_equal(some[~unknown], everything[~unknown])
+    assert (kept.mean_confidence or 0) > note.mean_confidence and (kept.labelled_pixels or 1) < note.labelled_pixels
     report = relabelled(part_labelled, tmp_path / "none.mcap", weights, min_confidence=1.0)
     assert report.note.labelled == 0 and report.note.unlabelled == 4  # no label rather than one of nothing
-    with LogReader(tmp_path / "none.mcap") as log:
-        assert [f.label is not None for f in log] == [True, True, False, False, False, False]
+    assert [f.label is not None for f in read(tmp_path / "none.mcap")[0]] == [True, True, False, False, False, False]
 
 
-def test_pseudo_labels_are_replaced_and_labels_of_people_only_on_request(
-    new: Path, folder: Path, tmp_path: Path
-) -> None:
+def test_pseudo_labels_are_replaced_and_labels_of_people_only_on_request(new: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     save_checkpoint(Checkpoint(tiny_field(seed=5), (), {"width": 96}), other)
-    again = relabelled(new, tmp_path / "again.mcap", other)
-    assert (again.note.kept, again.note.labelled) == (2, 4)
-    with LogReader(new) as before, LogReader(tmp_path / "again.mcap") as after:
-        pairs = list(zip(before, after, strict=True))
-        note = read_note(after.attachments())
-    assert note is not None and note.weights == "other.safetensors"
-    assert all(np.array_equal(a.label, b.label) for a, b in pairs[:2])
-    assert not any(np.array_equal(a.label, b.label) for a, b in pairs[2:])
-    forced = relabelled(new, tmp_path / "forced.mcap", other, overwrite_labels=True)
-    assert (forced.note.kept, forced.note.labelled, forced.note.replaced) == (0, 6, 2)
-    with LogReader(tmp_path / "forced.mcap") as log:
-        assert all(f.label_is_pseudo for f in log)
+    relabelled(new, tmp_path / "again.mcap", other)
+    after, note = read(tmp_path / "again.mcap")
+    assert (note.kept, note.labelled, note.weights) == (2, 4, "other.safetensors")
+    assert [same_labels(a, b) for a, b in zip(read(new)[0], after, strict=True)] == [True] * 2 + [False] * 4
+    relabelled(new, tmp_path / "forced.mcap", other, overwrite_labels=True)
+    forced, note = read(tmp_path / "forced.mcap")
+    assert (note.kept, note.labelled, note.replaced) == (0, 6, 2) and all(f.label_is_pseudo for f in forced)
 
 
-def test_eval_never_scores_on_pseudo_labels(
-    new: Path, weights: Path, config: Path, tmp_path: Path, part_labelled: Path
+def test_nothing_is_scored_on_pseudo_labels(
+    new: Path, part_labelled: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
-    file = tmp_path / "eval.json"
-    done = run("eval", new, "--weights", weights, "--config", config, "--out", file)
-    assert done.returncode == 0, done.stderr
+    options, file, all_pseudo = ("--weights", weights, "--config", config), tmp_path / "eval.json", tmp_path / "a.mcap"
+    said = run_ok("eval", new, *options, "--out", file).stdout
     scores = json.loads(file.read_text())["logs"][str(new)]
-    assert (scores["scored"], scores["pseudo_labelled"]) == (2, 4) and "4 with pseudo labels" in done.stdout
-    source = tmp_path / "source.json"
-    assert run("eval", part_labelled, "--weights", weights, "--config", config, "--out", source).returncode == 0
-    assert json.loads(source.read_text())["logs"][str(part_labelled)]["methods"] == scores["methods"]
-    relabelled(new, tmp_path / "all.mcap", weights, overwrite_labels=True)
-    done = run("eval", tmp_path / "all.mcap", "--weights", weights, "--config", config, "--out", file)
-    assert done.returncode == 1
-    assert "there is no score: all of its 6 label images are pseudo labels" in error_line(done.stderr)
-    assert "tiny.safetensors has rendered" in error_line(done.stderr)
-
-
-def test_replay_never_scores_on_pseudo_labels(new: Path, weights: Path, config: Path, tmp_path: Path) -> None:
-    relabelled(new, tmp_path / "all.mcap", weights, overwrite_labels=True)
-    for log, scored in ((new, 2), (tmp_path / "all.mcap", 0)):
-        out = tmp_path / log.stem
-        done = run("replay", log, "--out", out, "--weights", weights, "--config", config)
-        assert done.returncode == 0, done.stderr
-        summary = json.loads((out / "summary.json").read_text())
+    assert (scores["scored"], scores["pseudo_labelled"]) == (2, 4) and "4 with pseudo labels" in said
+    run_ok("eval", part_labelled, *options, "--out", file)
+    assert json.loads(file.read_text())["logs"][str(part_labelled)]["methods"] == scores["methods"]
+    relabelled(new, all_pseudo, weights, overwrite_labels=True)
+    said = refused("eval", all_pseudo, *options, "--out", file)
+    assert "all of its 6 label images are pseudo labels" in said and "tiny.safetensors has rendered" in said
+    for log, scored in ((new, 2), (all_pseudo, 0)):
+        said = run_ok("replay", log, "--out", tmp_path / log.stem, *options).stdout
+        summary = summary_of(tmp_path / log.stem)
         assert (summary["frames"]["scored"], summary["frames"]["pseudo_labels"]) == (scored, 6 - scored)
         assert (summary["metrics"]["miou"] is None) == (scored == 0)
-        assert f"{6 - scored} frames not scored: their labels are pseudo labels" in done.stdout
+        assert f"{6 - scored} frames not scored: their labels are pseudo labels" in said
 
 
 def test_finetune_learns_from_pseudo_labels_says_so_and_remembers_the_teachers_keyframes(
-    new: Path, part_labelled: Path, folder: Path, tmp_path: Path
+    part_labelled: Path, tmp_path: Path
 ) -> None:
-    stamps = [f.stamp_ns for f in tiny_frames(6)]
-    teacher = write_weights(tmp_path / "teacher.safetensors", stamps[:2])
+    stamps, student = [f.stamp_ns for f in tiny_frames(6)], tmp_path / "student.safetensors"
+    teacher, start = write_weights(tmp_path / "teacher.safetensors", stamps[:2]), write_weights(tmp_path / "w")
     relabelled(part_labelled, tmp_path / "new.mcap", teacher)
-    student = tmp_path / "student.safetensors"
-    options = (
-        "--keyframes",
-        "4",
-        "--seconds",
-        "0",
-        "--steps",
-        "2",
-        "--weights",
-        write_weights(tmp_path / "w.safetensors"),
-    )
-    done = run("finetune", tmp_path / "new.mcap", *options, "--out", student)
-    assert done.returncode == 0, done.stderr
-    assert "of the 4 keyframes have pseudo labels that teacher.safetensors has rendered" in done.stdout
+    options = ("--keyframes", "4", "--seconds", "0", "--steps", "2", "--weights", start, "--out", student)
+    said = run_ok("finetune", tmp_path / "new.mcap", *options).stdout
+    assert "of the 4 keyframes have pseudo labels that teacher.safetensors has rendered" in said
     checkpoint = load_checkpoint(student)
     assert checkpoint.recipe["pseudo_labels"]["keyframes"] >= 2
     assert set(stamps[:2]) <= checkpoint.train_stamps_ns
@@ -238,32 +197,20 @@ def test_export_and_import_keep_pseudo_labels_apart(new: Path, tmp_path: Path) -
     assert [f.name for f in sorted((tmp_path / "folder" / "label").iterdir())] == ["000000.png", "000001.png"]
     assert len(list((tmp_path / "folder" / "pseudo_label").iterdir())) == 4
     back = import_recording(tmp_path / "folder", tmp_path / "back.mcap")
-    with LogReader(new) as one, LogReader(tmp_path / "back.mcap") as other:
-        assert read_note(other.attachments()) == read_note(one.attachments()) is not None
     assert back.labelled == 2 and any("4 frames with pseudo labels" in notice for notice in back.notices)
-    with LogReader(new) as one, LogReader(tmp_path / "back.mcap") as other:
-        for a, b in zip(one, other, strict=True):
-            assert a.label_is_pseudo == b.label_is_pseudo and np.array_equal(a.label, b.label)
+    (frames, note), (others, other_note) = read(new), read(tmp_path / "back.mcap")
+    assert note == other_note and all(map(same_labels, frames, others))
 
 
-def without_depth(path: Path, frames: tuple[PosedFrame, ...]) -> Path:
-    return write_log(path, [dataclasses.replace(f, depth_m=None, label=None) for f in frames])
-
-
-@pytest.fixture(scope="module")
-def with_depth(folder: Path, weights: Path) -> Path:
-    """A log without depth, labelled with ``--depth``."""
-    plain = without_depth(folder / "plain.mcap", tiny_frames(6))
-    request = AutolabelRequest(
-        (plain,), folder / "deep.mcap", weights, tiny_config(depth={"from_motion": {"delay_frames": 2}}), depth=True
-    )
-    report = autolabel_log(request)
+def test_computed_depth_has_its_spread_and_never_passes_for_measured(
+    weights: Path, config: Path, tmp_path: Path
+) -> None:
+    frames = [replace(f, depth_m=None, label=None) for f in tiny_frames(6)]
+    plain, deep = write_log(tmp_path / "plain.mcap", frames), tmp_path / "deep.mcap"
+    settings = tiny_config(depth={"from_motion": {"delay_frames": 2}})
+    report = autolabel_log(AutolabelRequest((plain,), deep, weights, settings, depth=True))
     assert report.note.depth_written > 2
-    return folder / "deep.mcap"
-
-
-def test_computed_depth_has_its_spread_and_never_passes_for_measured(with_depth: Path, tmp_path: Path) -> None:
-    with LogReader(with_depth) as log:
+    with LogReader(deep) as log:
         frames = [f for f in log if f.depth_m is not None]
         assert [e.seq for e, _ in log.frame_parts()] == list(range(6))  # in order, though frames wait for later ones
         export_log(log, tmp_path / "folder", "folder")
@@ -272,7 +219,7 @@ def test_computed_depth_has_its_spread_and_never_passes_for_measured(with_depth:
     for frame in frames:
         assert frame.depth_sigma_m is not None and not is_measured(frame) and frame.depth_m is not None
         assert (frame.depth_sigma_m[frame.depth_m > 0] > 0).all()
-    found = json.loads(run("info", with_depth, "--json").stdout)
+    found = json.loads(run("info", deep, "--json").stdout)
     assert (found["frames_with_depth"], found["frames_with_computed_depth"]) == (0, len(frames))
     assert not (tmp_path / "folder" / "depth").exists() and not (tmp_path / "tum" / "depth").exists()
     assert any("computed, not a sensor's" in notice for notice in tum.notices)
@@ -281,84 +228,53 @@ def test_computed_depth_has_its_spread_and_never_passes_for_measured(with_depth:
         others = [f for f in back if f.depth_m is not None]
     for a, b in zip(frames, others, strict=True):
         assert np.array_equal(a.depth_m, b.depth_m) and np.array_equal(a.depth_sigma_m, b.depth_sigma_m)  # type: ignore[arg-type]
-
-
-def test_a_log_with_computed_depth_replays_as_computed_and_off_leaves_it_out(
-    with_depth: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
     for source, key in (("auto", "computed_fraction"), ("off", "rendered_fraction"), ("sensor", "rendered_fraction")):
-        done = run(
-            "replay",
-            with_depth,
-            "--out",
-            tmp_path / source,
-            "--weights",
-            weights,
-            "--config",
-            config,
-            "--depth",
-            source,
-        )
-        summary = json.loads((tmp_path / source / "summary.json").read_text())
-        assert done.returncode == (0 if summary["map"]["surface_points"] else 3), done.stderr
-        assert summary["depth"][key] == 1.0
+        out, options = tmp_path / source, ("--weights", weights, "--config", config, "--depth", source)
+        done = run("replay", deep, "--out", out, *options)
+        assert done.returncode == (0 if summary_of(out)["map"]["surface_points"] else 3), done.stderr
+        assert summary_of(out)["depth"][key] == 1.0
 
 
 def test_parts_stay_parts(weights: Path, tmp_path: Path) -> None:
     source, new = tmp_path / "source", tmp_path / "new"
     source.mkdir(), new.mkdir()
-    info = StreamInfo("test room", {"rooms": INTRINSICS})
-    with_frames = [encode_frame(f) for f in unlabelled(tiny_frames(6))]
-    recording = Recording(
-        source / "day.mcap", info, RecordingRules(split_bytes=2 * sum(map(len, with_frames[0]))), recording="r1"
-    )
-    for parts in with_frames:
+    encoded = [encode_frame(replace(f, label=None)) for f in tiny_frames(6)]
+    rules = RecordingRules(split_bytes=2 * sum(map(len, encoded[0])))
+    recording = Recording(source / "day.mcap", StreamInfo("room", {"rooms": INTRINSICS}), rules, recording="r1")
+    for parts in encoded:
         recording.write(parts)
     recording.close()
     with open_log(source) as log:
         counts = [len(LogReader(part)) for part in log.paths]
     assert len(counts) > 1
-    done = run("autolabel", source, "--weights", weights, "--out", new / "day.mcap")
-    assert done.returncode == 0, done.stderr
+    run_ok("autolabel", source, "--weights", weights, "--out", new / "day.mcap")
     with open_log(new) as log:
         made = [LogReader(part) for part in log.paths]
         assert [len(part) for part in made] == counts and not log.notices
         assert all(f.label_is_pseudo for f in log)
         notes = [read_note(part.attachments()) for part in made]
     assert notes[0] is not None and notes[0].frames == 6 and all(note == notes[0] for note in notes)
-    done = run("autolabel", source, "--weights", weights, "--out", source / "more.mcap")
-    assert done.returncode == 1 and "would be read as one" in error_line(done.stderr)
-
-
-OTHER = make_label_set("kitchen", ["stove", "spoon"])
-
-
-def write_labels_of(path: Path, label_set: LabelSet) -> Path:
-    frames = [dataclasses.replace(f, label=np.full((72, 96), label_set.ids[0], np.uint8)) for f in tiny_frames(3)]
-    with LogWriter(path, StreamInfo("t", {"rooms": INTRINSICS}, label_set)) as log:
-        for frame in frames:
-            log.write_frame(frame)
-    return path
+    said = refused("autolabel", source, "--weights", weights, "--out", source / "more.mcap")
+    assert "would be read as one" in said
 
 
 def test_other_classes_are_refused_unless_all_labels_go(weights: Path, tmp_path: Path) -> None:
-    log, out = write_labels_of(tmp_path / "log.mcap", OTHER), tmp_path / "new.mcap"
-    done = run("autolabel", log, "--weights", weights, "--out", out)
-    said = error_line(done.stderr)
-    assert done.returncode == 1 and not out.exists()
-    assert "'kitchen' (stove, spoon)" in said and "'rooms' (wall, floor" in said and "--overwrite-labels" in said
-    assert run("autolabel", log, "--weights", weights, "--out", out, "--overwrite-labels").returncode == 0
+    kitchen = make_label_set("kitchen", ["stove", "spoon"])
+    frames = [replace(f, label=np.full((72, 96), kitchen.ids[0], np.uint8)) for f in tiny_frames(3)]
+    command = ("autolabel", write_log(tmp_path / "log.mcap", frames, kitchen), "--weights", weights)
+    out = tmp_path / "new.mcap"
+    said = refused(*command, "--out", out)
+    assert "'kitchen' (stove, spoon)" in said and "'rooms' (wall, floor" in said and not out.exists()
+    run_ok(*command, "--out", out, "--overwrite-labels")
     with LogReader(out) as new:
         assert new.info.label_set == ROOMS
 
 
 def test_the_same_classes_with_other_ids_become_the_logs_ids(weights: Path, tmp_path: Path) -> None:
     shifted = make_label_set("rooms+100", ROOMS.names, ids=[i + 100 for i in ROOMS.ids])
-    log = write_labels_of(tmp_path / "log.mcap", shifted)
-    with LogReader(log) as old, LogWriter(tmp_path / "more.mcap", old.info) as more:
-        for i, frame in enumerate(old):
-            more.write_frame(frame if i == 0 else dataclasses.replace(frame, label=None))
-    report = relabelled(tmp_path / "more.mcap", tmp_path / "new.mcap", weights)
+    label = np.full((72, 96), shifted.ids[0], np.uint8)
+    frames = [replace(f, label=label if i == 0 else None) for i, f in enumerate(tiny_frames(3))]
+    report = relabelled(write_log(tmp_path / "log.mcap", frames, shifted), tmp_path / "new.mcap", weights)
     assert (report.note.kept, report.note.labelled) == (1, 2)
     with LogReader(tmp_path / "new.mcap") as new:
         assert new.info.label_set == shifted
@@ -375,9 +291,7 @@ def test_places_that_are_taken_are_refused(log: Path, new: Path, weights: Path, 
         (log, tmp_path, "is a folder"),
         (tmp_path / "none.mcap", tmp_path / "out.mcap", "none.mcap"),
     ):
-        done = run("autolabel", source, "--weights", weights, "--out", out)
-        assert done.returncode == 1 and said in error_line(done.stderr)
-        assert done.stdout == ""
+        assert said in refused("autolabel", source, "--weights", weights, "--out", out)
     assert new.read_bytes() == before
 
 
@@ -385,30 +299,21 @@ def test_what_is_damaged_is_left_out_and_named(part_labelled: Path, weights: Pat
     data = bytearray(part_labelled.read_bytes())
     data[len(data) // 2] ^= 0xFF
     (tmp_path / "damaged.mcap").write_bytes(data)
-    done = run("autolabel", tmp_path / "damaged.mcap", "--weights", weights, "--out", tmp_path / "new.mcap")
-    assert done.returncode == 0, done.stderr
-    assert "damaged, left out: " in done.stdout
-    with LogReader(tmp_path / "new.mcap") as log:
-        assert len(log) == 5 and not log.errors
-        note = read_note(log.attachments())
-    assert note is not None and note.frames == 5
+    said = run_ok("autolabel", tmp_path / "damaged.mcap", "--weights", weights, "--out", tmp_path / "new.mcap").stdout
+    frames, note = read(tmp_path / "new.mcap")
+    assert "damaged, left out: " in said and len(frames) == note.frames == 5
 
 
 def test_frames_that_cannot_be_rendered_stay_without_a_label(new: Path, weights: Path, tmp_path: Path) -> None:
     odd = np.eye(4)
     odd[0, 0] = 3.0
-    with LogReader(new) as log, LogWriter(tmp_path / "odd.mcap", log.info) as writer:
-        for i, frame in enumerate(log):
-            writer.write_frame(dataclasses.replace(frame, T_world_camera=odd) if i == 4 else frame)
-    report = relabelled(tmp_path / "odd.mcap", tmp_path / "out.mcap", weights)
+    bent = [replace(frame, T_world_camera=odd) for frame in read(new)[0]]
+    some = [*read(new)[0][:4], bent[4], read(new)[0][5]]
+    report = relabelled(write_log(tmp_path / "odd.mcap", some), tmp_path / "out.mcap", weights)
     assert len(report.unlabelled) == 1 and "rotation" in report.unlabelled[0]
-    with LogReader(tmp_path / "out.mcap") as log:
-        assert [f.label is None for f in log] == [False] * 4 + [True, False]  # its old pseudo label is gone
-    with LogReader(new) as log, LogWriter(tmp_path / "all.mcap", log.info) as writer:
-        for frame in log:
-            writer.write_frame(dataclasses.replace(frame, T_world_camera=odd))
+    assert [f.label is None for f in read(tmp_path / "out.mcap")[0]] == [False] * 4 + [True, False], "the old one went"
     with pytest.raises(LogError, match="none of its 6 frames could be rendered"):
-        relabelled(tmp_path / "all.mcap", tmp_path / "none.mcap", weights)
+        relabelled(write_log(tmp_path / "all.mcap", bent), tmp_path / "none.mcap", weights)
     assert not (tmp_path / "none.mcap").exists()
 
 

@@ -11,14 +11,12 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.keys import ServerIdentity, load_keys
 from tests.nodes.mapper.test_query_service import answering
-from tests.nodes.support import run, run_here
+from tests.nodes.support import refused, run_ok
 from tests.queries.scene import whole_map
 
 
-def keys(*arguments: object) -> str:
-    done = run("keys", *arguments)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def keys(*arguments: str | Path) -> str:
+    return run_ok("keys", *arguments).stdout
 
 
 @pytest.mark.slow
@@ -38,31 +36,21 @@ def test_a_map_is_asked_from_another_machine(tmp_path: Path) -> None:
             assert client.info().blocks == whole_map().block_count
         with MapClient(endpoint, timeout_s=0.2, attempts=1) as clear, pytest.raises(TransportError, match="no answer"):
             clear.info()
-        asked = run("query", endpoint, "info", "--server", "robot", "--keys", desk)
-        assert asked.returncode == 0 and "table" in asked.stdout, asked.stderr
+        query = ("query", endpoint, "info", "--server", "robot", "--keys", desk)
+        assert "table" in run_ok(*query).stdout
         keys("forget", "desk", "--keys", robot)
-        refused = run("query", endpoint, "info", "--server", "robot", "--keys", desk)
-    assert refused.returncode == 1 and "Does it know this machine's key" in refused.stderr
+        assert "Does it know this machine's key" in refused(*query)
 
 
 @pytest.mark.parametrize(
-    "verb",
+    "words",
     [
-        ("query", "tcp://192.0.2.1:5570", "info"),
-        ("view", "--status", "tcp://192.0.2.1:5570", "--once"),
-        ("info", "tcp://192.0.2.1:5570"),
-        ("label", "room.mcap", "--keyframes", "2", "--to", "tcp://0.0.0.0:5570"),
+        "query tcp://192.0.2.1:5570 info",
+        "view --status tcp://192.0.2.1:5570 --once",
+        "info tcp://192.0.2.1:5570",
+        "label {log} --keyframes 2 --to tcp://0.0.0.0:5570",
     ],
-    ids=lambda verb: verb[0],
 )
-def test_no_verb_speaks_to_another_machine_without_keys(verb: tuple[str, ...], log: Path) -> None:
-    code, said = run_here(*(log if word == "room.mcap" else word for word in verb))
-    assert code == 1 and "semantic-mapper keys make" in said and "ssh -L" in said
-
-
-def test_wrong_use_is_told(tmp_path: Path) -> None:
-    assert "make them with" in run("keys", "show", "--keys", tmp_path / "none").stderr
-    keys("make", "--keys", tmp_path / "own")
-    assert "there are keys already" in run("keys", "make", "--keys", tmp_path / "own").stderr
-    assert "no public key" in run("keys", "allow", "desk", "nonsense", "--keys", tmp_path / "own").stderr
-    assert "there are: none" in run("keys", "forget", "desk", "--keys", tmp_path / "own").stderr
+def test_no_verb_speaks_to_another_machine_without_keys(words: str, log: Path) -> None:
+    said = refused(*words.format(log=log).split())
+    assert "semantic-mapper keys make" in said and "ssh -L" in said

@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterable
 from pathlib import Path
-
-import pytest
 
 from semantic_mapper.nodes.cli.main import VERBS
 from tests.contract import entry_points as api
@@ -31,92 +28,62 @@ for use in uses:
 with open("found.json", "w") as file:
     json.dump(found, file)
 """
+LIGHT = (
+    "info room.mcap",
+    "info map.npz",
+    "query map.npz info",
+    "query map.npz at 0 0 0.3",
+    "query map.npz nearest floor 0 0 1",
+    "query map.npz instances",
+    "query map.npz graph",
+    "export room.mcap --out folder",
+    "export room.mcap --out foxglove.mcap",
+    "export room.mcap --out trajectory.txt",
+    "export room.mcap --out tum --format tum",
+    "import folder again.mcap",
+    "import room.mcap clean.mcap",
+    "export map.npz --out map.ply",
+    "info boxes.json",
+    "keys make --keys keys",
+    "keys show --keys keys",
+)
+ERRORS = (  # of what is heavy where it goes well
+    "query map.npz nearest unicorn 0 0 1",
+    "export none.npz --out x.ply",
+    "replay none.mcap --out x",
+    "replay none.mp4 --out x",
+    "eval none.mcap",
+    "finetune none.mcap --keyframes 3 --seconds 9 --out x.safetensors",
+    "autolabel none.mcap --weights rooms --out x.mcap",
+    "label none.mcap --suggest 3",
+    "merge none.npz map.npz --out x.npz",
+    "query map.npz relocalize none.mcap",
+    "calibrate none",
+    "fleet run replay none.mcap --out x",
+    "refine none.npz --out x.npz",
+    "view none.mcap",
+    "up none.toml",
+)
 
 
-def loaded(folder: Path, uses: Iterable[str]) -> list[tuple[int, list[str]]]:
-    """Exit code of each use of the command in one process, and which heavy packages are loaded after it."""
+def assert_light(folder: Path, uses: dict[str, int]) -> None:
+    """Uses of the command in one process end with these exit codes and load nothing heavy."""
     arguments = json.dumps(([use.split() for use in uses], HEAVY))
     command = [sys.executable, "-c", PROGRAM, arguments]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr
-    return [(code, names) for code, names in json.loads((folder / "found.json").read_text())]
+    found = dict(zip(uses, json.loads((folder / "found.json").read_text()), strict=True))
+    assert found == {use: [code, []] for use, code in uses.items()}
 
 
-@pytest.fixture
-def files(log: Path, tmp_path: Path) -> Path:
-    """Holds room.mcap, map.npz and boxes.json."""
+def test_help_light_verbs_and_errors_load_no_heavy_package(log: Path, tmp_path: Path) -> None:
     (tmp_path / "room.mcap").symlink_to(log)
     whole_map().save(tmp_path / "map.npz")
     box = {"id": 1, "class": "chair", "T_world_box": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
     (tmp_path / "boxes.json").write_text(json.dumps({"boxes": [{**box, "size": [1, 1, 1]}]}))
-    return tmp_path
-
-
-def test_no_help_loads_a_heavy_package(tmp_path: Path) -> None:
-    commands = {name: api.verb_of(name) for name in VERBS}
-    groups = {name: command.commands for name, command in commands.items() if hasattr(command, "commands")}
-    verbs = ["", *commands, *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)]
-    uses = [f"{verb} --help" for verb in verbs]
-    assert loaded(tmp_path, uses) == [(0, [])] * len(uses)
-
-
-def test_light_verbs_load_no_heavy_package(files: Path) -> None:
-    uses = {
-        "info room.mcap": 0,
-        "info map.npz": 0,
-        "query map.npz info": 0,
-        "query map.npz at 0 0 0.3": 0,
-        "query map.npz nearest floor 0 0 1": 0,
-        "query map.npz instances": 0,
-        "query map.npz graph": 0,
-        "export room.mcap --out folder": 0,
-        "export room.mcap --out foxglove.mcap": 0,
-        "export room.mcap --out trajectory.txt": 0,
-        "export room.mcap --out tum --format tum": 0,
-        "import folder again.mcap": 0,
-        "import room.mcap clean.mcap": 0,
-        "export map.npz --out map.ply": 0,
-        "info boxes.json": 0,
-        "keys make --keys keys": 0,
-        "keys show --keys keys": 0,
-    }
-    found = loaded(files, uses)
-    assert dict(zip(uses, found, strict=True)) == {use: (code, []) for use, code in uses.items()}
-
-
-def test_errors_that_need_no_heavy_package_load_none(files: Path) -> None:
-    uses = {
-        "info none.mcap": 1,
-        "info none.npz": 1,
-        "query none.npz info": 1,
-        "query none info": 1,
-        "query map.npz nearest unicorn 0 0 1": 1,
-        "query map.npz whither": 2,
-        "export none.mcap --out x": 1,
-        "export none.npz --out x.ply": 1,
-        "import none x.mcap": 1,
-        "replay none.mcap --out x": 1,
-        "replay none.mp4 --out x": 1,
-        "eval none.mcap": 1,
-        "finetune none.mcap --keyframes 3 --seconds 9 --out x.safetensors": 1,
-        "autolabel none.mcap --weights rooms --out x.mcap": 1,
-        "label none.mcap --suggest 3": 1,
-        "import none.mcap x.mcap": 1,
-        "merge none.npz map.npz --out x.npz": 1,
-        "compare none.npz map.npz": 2,
-        "query none.npz relocalize room.mcap": 1,
-        "query map.npz relocalize none.mcap": 1,
-        "calibrate none": 1,
-        "fleet run replay none.mcap --out x": 1,
-        "refine none.npz --out x.npz": 1,
-        "info none.json": 1,
-        "view none.mcap": 1,
-        "up none.toml": 1,
-        "keys show --keys none": 1,
-        "fly": 2,
-    }
-    found = loaded(files, uses)
-    assert dict(zip(uses, found, strict=True)) == {use: (code, []) for use, code in uses.items()}
+    groups = {name: getattr(api.verb_of(name), "commands", ()) for name in VERBS}
+    verbs = ["", *groups, *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)]
+    assert_light(tmp_path, {f"{verb} --help": 0 for verb in verbs} | dict.fromkeys(LIGHT, 0) | dict.fromkeys(ERRORS, 1))
 
 
 def test_who_asks_a_running_mapper_loads_no_heavy_package(tmp_path: Path) -> None:
@@ -132,6 +99,5 @@ def test_who_asks_a_running_mapper_loads_no_heavy_package(tmp_path: Path) -> Non
         done = subprocess.run(
             [sys.executable, "-c", robot, endpoint], capture_output=True, text=True, timeout=100, check=False
         )
-        found = loaded(tmp_path, [f"query {endpoint} {question}" for question in ("info", "nearest floor 0 0 1")])
+        assert_light(tmp_path, {f"query {endpoint} {question}": 0 for question in ("info", "nearest floor 0 0 1")})
     assert done.stdout.strip() == "True True []", done.stderr
-    assert found == [(0, []), (0, [])]

@@ -2,71 +2,40 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from semantic_mapper import __version__
-from semantic_mapper.nodes.cli.main import VERBS as VERBS_AND_TEXTS
+from semantic_mapper.nodes.cli.main import VERBS
 from tests.contract import entry_points as api
-from tests.nodes.support import run, run_here, run_process
-
-VERBS = sorted(name for name in VERBS_AND_TEXTS if not hasattr(api.verb_of(name), "commands"))
+from tests.nodes.support import refused, run_ok
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_explains_itself_with_an_example(verb: str) -> None:
-    done = run_process(verb, "--help")
-    assert done.returncode == 0, done.stderr
-    assert f"Example: semantic-mapper {verb}" in done.stdout
-    assert done.stderr == ""
-
-
-def test_help_lists_all_verbs() -> None:
-    done = run("--help")
-    assert done.returncode == 0
-    assert all(f"  {verb} " in done.stdout for verb in VERBS)
-    codes = " ".join(done.stdout.split()).partition("Exit codes: ")[2].partition(".")[0]
+def test_help_lists_all_verbs_and_each_explains_itself_with_an_example() -> None:
+    assert run_ok("--version").stdout == f"semantic-mapper {__version__}\n"
+    listed = run_ok("--help").stdout
+    codes = " ".join(listed.split()).partition("Exit codes: ")[2].partition(".")[0]
     assert [word for word in codes.replace(",", " ").split() if word.isdigit()] == ["0", "1", "2", "3", "130"]
-
-
-def test_the_list_of_verbs_says_what_each_says_of_itself() -> None:
-    for name, (_, text) in VERBS_AND_TEXTS.items():
-        said = " ".join((api.verb_of(name).help or "").split())
-        assert said.startswith(text.rstrip(".")), name
-
-
-def test_version_is_that_of_the_package() -> None:
-    assert run("--version").stdout == f"semantic-mapper {__version__}\n"
+    for name, (_, text) in VERBS.items():
+        verb = api.verb_of(name)
+        assert f"  {name} " in listed and " ".join((verb.help or "").split()).startswith(text.rstrip(".")), name
+        if not hasattr(verb, "commands"):
+            shown = run_ok(name, "--help")
+            assert f"Example: semantic-mapper {name}" in shown.stdout and not shown.stderr
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "words",
     [
-        ("replai",),
-        ("replay", "room.mcap"),
-        ("replay", "room.mcap", "--out", "x", "--voxel-size", "-1"),
-        ("import", "src", "dst", "--format", "film"),
-        ("import", "src", "dst", "--topic", "image"),
-        ("finetune", "room.mcap", "--keyframes", "1", "--out", "w"),
-        ("finetune", __file__, "--keyframes", "4", "--out", "w", "--seconds", "0"),
-        ("eval",),
-        ("query", "map.npz", "where"),
-        ("query", "map.npz", "at", "1", "2"),
-        ("query", "map.npz", "at", "1", "2", "east"),
-        ("query", "map.npz", "nearest", "1", "2", "3"),
-        ("query", "map.npz", "info", "--jason", "x"),
+        "replay room.mcap --out x --voxel-size -1",
+        "import src dst --format film",
+        "import src dst --topic image",
+        f"finetune {__file__} --keyframes 4 --out w --seconds 0",
+        "eval",
+        "query map.npz at 1 2 east",
+        "query map.npz nearest 1 2 3",
+        "query map.npz info --jason x",
+        *(f"record x.mcap --duration {number}" for number in ("inf", "nan", "1e308")),
     ],
 )
-def test_wrong_usage_exits_with_2_and_says_so_on_stderr(arguments: tuple[str, ...]) -> None:
-    done = run(*arguments)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert "Usage: semantic-mapper" in done.stderr
-
-
-@pytest.mark.parametrize("number", ["inf", "nan", "1e308"])
-def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
-    code, said = run_here("record", tmp_path / "x.mcap", "--duration", number)
-    assert code == 2 and "--duration" in said
+def test_wrong_usage_exits_with_2_and_says_so(words: str) -> None:
+    assert "Usage: semantic-mapper" in refused(*words.split(), code=2)

@@ -10,19 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.replay.boxes import load_boxes
-from semantic_mapper.replay.finetune_log import FrameSource, choose_frames, match_boxes, open_pseudo_labels
+from semantic_mapper.replay.finetune_log import FrameSource, choose_frames, open_pseudo_labels
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.jobs import AutolabelRequest, FinetuneRequest, autolabel_log
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.config import FinetuneConfig
 from tests.nodes.cli.test_autolabel import StopsAfter
-from tests.nodes.support import error_line, run
+from tests.nodes.support import refused, run_ok
 from tests.small import tiny_frames
 
 BOXED, MOVING = 9, 10  # ids of boxes
@@ -65,8 +63,7 @@ def fitted(log: Path, boxes: Path, settings: Path, folder: Path) -> tuple[Path, 
     """Weights with boxes, and what was said of them."""
     out = folder / "boxed.safetensors"
     arguments = ("--kind", "panoptic", "--boxes", boxes, "--steps", "30", "--seconds", "0", "--config", settings)
-    done = run("finetune", log, *arguments, "--out", out)
-    assert done.returncode == 0, done.stderr
+    done = run_ok("finetune", log, *arguments, "--out", out)
     return out, " ".join(done.stdout.split())
 
 
@@ -79,8 +76,7 @@ def test_boxes_become_labels_and_things_that_never_score(
     checkpoint = load_checkpoint(out)
     assert checkpoint.train_stamps_ns == {f.stamp_ns for f in tiny_frames(6)}  # their labels are true ones
     things = tmp_path / "things"
-    done = run("autolabel", log, "--weights", out, "--overwrite-labels", "--instances", things, "--out", new)
-    assert done.returncode == 0, done.stderr
+    run_ok("autolabel", log, "--weights", out, "--overwrite-labels", "--instances", things, "--out", new)
     listed = json.loads((things / "instances.json").read_text())["instances"]
     assert [thing["id"] for thing in listed] == [BOXED, MOVING]
     assert sorted(path.name for path in things.iterdir()) == ["instances.json", "rooms"]
@@ -94,14 +90,12 @@ def test_boxes_become_labels_and_things_that_never_score(
                 assert int((ids == thing["id"]).sum()) == thing["pixels"].get(f"rooms/{number:06d}", 0)
             assert (frame.label[ids > 0] == ROOMS.id_of(listed[0]["class"])).all()
     assert listed[0]["pixels"] and list(listed[1]["pixels"]) == [f"rooms/{WHEN:06d}"]
-    done = run("eval", new, "--weights", out)
-    assert done.returncode == 1 and "pseudo" in error_line(done.stderr)
+    assert "pseudo" in refused("eval", new, "--weights", out)
     # As if nobody had seen the true labels, its things are scored against themselves.
     unseen, file = tmp_path / "unseen.safetensors", tmp_path / "eval.json"
     save_checkpoint(replace(checkpoint, recipe=checkpoint.recipe | {"train_stamps_ns": []}), unseen)
     few = ("--instances", things, "--max-frames", "1", "--config", config)
-    done = run("eval", log, "--weights", unseen, *few, "--out", file)
-    assert done.returncode == 0, done.stderr
+    run_ok("eval", log, "--weights", unseen, *few, "--out", file)
     methods = json.loads(file.read_text())["logs"][str(log)]["methods"]
     assert methods["panoptic"]["panoptic_frames"] == methods["map seen from frames"]["panoptic_frames"] == 1
     assert methods["panoptic"]["pq_per_class"][listed[0]["class"]]["pq"] > 0.5
@@ -128,38 +122,17 @@ def test_frames_with_labels_go_before_others() -> None:
     assert choose_frames(3, 9, frozenset((1,))) == [0, 1, 2]
 
 
-def test_a_class_that_labels_lack_says_whose_classes_they_are(log: Path, boxes: Path, tmp_path: Path) -> None:
-    strange = tmp_path / "strange.json"
-    strange.write_text(boxes.read_text().replace('"class": "', '"class": "un'))
-    expected = r"own label images: correct the classes of the boxes"
-    with open_log(log) as opened, pytest.raises(ConfigError, match=expected):
-        match_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
-
-
-def test_boxes_by_frame_of_a_drive_are_refused_for_another_log(log: Path, boxes: Path, tmp_path: Path) -> None:
-    timeless = tmp_path / "timeless.json"
-    timeless.write_text(boxes.read_text().replace('"stamps"', '"frames"'))
-    done = run("finetune", log, "--kind", "panoptic", "--boxes", timeless, "--out", tmp_path / "w.safetensors")
-    assert done.returncode == 1 and "give the log that `import` made of the drive" in error_line(done.stderr)
-
-
-def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
-    out = tmp_path / "w.safetensors"
-    for arguments, said in (
-        (("--kind", "panoptic"), "--kind panoptic and --boxes FILE go together"),
-        (("--boxes", boxes, "--keyframes", "2"), "--kind panoptic and --boxes FILE go together"),
-        (("--kind", "panoptic", "--boxes", boxes, "--keyframes", "2"), "panoptic learns from no keyframes"),
-        (("--keyframes", "2", "--pseudo", "rooms"), "goes with --kind panoptic only"),
+def test_boxes_that_do_not_fit_are_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
+    wrong, text = tmp_path / "wrong.json", boxes.read_text()
+    command = ("finetune", log, "--kind", "panoptic", "--boxes", wrong, "--out", tmp_path / "w.safetensors")
+    for changed, said in (
+        (text.replace('"class": "', '"class": "x', 1), "box with id 9: label set 'rooms' has no class"),
+        (text.replace('"stamps"', '"frames"'), "give the log that `import` made of the drive"),
     ):
-        done = run("finetune", log, *arguments, "--out", out)
-        assert done.returncode == 2 and said in " ".join(done.stderr.split())
-    broken = tmp_path / "broken.json"
-    broken.write_text(boxes.read_text().replace('"class": "', '"class": "x', 1))
-    done = run("finetune", log, "--kind", "panoptic", "--boxes", broken, "--out", out)
-    assert done.returncode == 1 and "box with id 9: label set 'rooms' has no class" in error_line(done.stderr)
-    done = run("autolabel", log, "--weights", weights, "--instances", tmp_path / "i", "--out", tmp_path / "n.mcap")
-    assert done.returncode == 1 and "has no boxes" in error_line(done.stderr)
-    assert not (tmp_path / "i").exists()
+        wrong.write_text(changed)
+        assert said in refused(*command)
+    options = ("--weights", weights, "--instances", tmp_path / "i", "--out", tmp_path / "n.mcap")
+    assert "has no boxes" in refused("autolabel", log, *options) and not (tmp_path / "i").exists()
 
 
 def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weights: Path) -> None:

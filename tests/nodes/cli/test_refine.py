@@ -1,4 +1,4 @@
-"""``refine``, and ``train --kind nesf``, as commands."""
+"""``refine``, as a command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.test_refine import make_map, random_weights
-from tests.nodes.support import error_line, run, write_weights
+from tests.nodes.support import refused, run_ok, write_weights
 
 
 @pytest.fixture(scope="module")
@@ -27,32 +27,25 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_refined_map_is_a_map_like_any_other(files: Path, tmp_path: Path) -> None:
-    out = tmp_path / "new" / "refined.npz"
-    done = run("refine", files, "--weights", files / "nesf.safetensors", "--up", "z", "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "of the surface relabelled" in done.stdout and "wall" in done.stdout
+    out, weights = tmp_path / "new" / "refined.npz", files / "nesf.safetensors"
+    said = run_ok("refine", files, "--weights", weights, "--up", "z", "--out", out).stdout
+    assert "of the surface relabelled" in said and "by the weights" in said
     before, after = VoxelMap.load(files / "map.npz"), VoxelMap.load(out)
-    assert after.refined == load_nesf(files / "nesf.safetensors").digest
+    assert after.refined == load_nesf(weights).digest
     np.testing.assert_array_equal(before.block_state()["tsdf"], after.block_state()["tsdf"])
     assert (before.points().label != after.points().label).any()
-    queried = run("query", out, "info", "--json")
-    assert queried.returncode == 0, queried.stderr
-
-
-def test_json_tells_classes_before_and_after(files: Path, tmp_path: Path) -> None:
-    out = tmp_path / "refined.npz"
-    weights = files / "nesf.safetensors"
-    done = run("refine", files, "--weights", weights, "--up", "z", "--out", out, "--fill", "1", "--json")
-    assert done.returncode == 0, done.stderr
+    run_ok("query", out, "info", "--json")
+    done = run_ok("refine", files, "--weights", weights, "--up", "z", "--out", out, "--fill", "1", "--json")
     found = json.loads(done.stdout)
     assert found["filled"] == 0 and found["relabelled"] > 0
     assert sum(found["before"].values()) == sum(found["after"].values()) == found["surface"]
+    run_ok("refine", files, "--up", "z", "--out", out)
+    assert VoxelMap.load(out).refined == load_nesf(SHIPPED).digest
 
 
 def test_maps_of_other_classes_than_the_weights_that_ship_are_smoothed(tmp_path: Path) -> None:
     make_map(NYU40).save(tmp_path / "map.npz")
-    done = run("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
-    assert done.returncode == 0, done.stderr
+    done = run_ok("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
     assert "the votes were smoothed, nothing was learned" in done.stdout
     before, after = (VoxelMap.load(tmp_path / name).mesh() for name in ("map.npz", "smooth.npz"))
 
@@ -62,35 +55,17 @@ def test_maps_of_other_classes_than_the_weights_that_ship_are_smoothed(tmp_path:
     assert borders(after.label) < 0.8 * borders(before.label), "chance votes become patches"
 
 
-def test_what_refined_the_map_is_told(files: Path, tmp_path: Path) -> None:
-    ways = {"learned": ("--weights", files / "nesf.safetensors"), "shipped": (), "smooth": ("--weights", "smoothed")}
-    said = {"learned": "by the weights", "shipped": "by the weights nesf-rooms", "smooth": "the votes were smoothed"}
-    for name, options in ways.items():
-        done = run("refine", files, "--up", "z", "--out", tmp_path / f"{name}.npz", *options)
-        assert done.returncode == 0, done.stderr
-        assert said[name] in done.stdout
-    assert VoxelMap.load(tmp_path / "shipped.npz").refined == load_nesf(SHIPPED).digest
-
-
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("words", "said"),
     [
-        (("map.npz", "--out", "map.npz"), "the result is made from it"),
-        (("missing.npz", "--out", "out.npz"), "no such map"),
-        (("nesf.safetensors", "--out", "out.npz"), "not a map"),
-        (("map.npz", "--out", "out.npz", "--weights", "field.safetensors"), "weights of kind 'sray'"),
-        (("map.npz", "--out", "out.npz", "--weights", "missing.safetensors"), "train --kind nesf"),
-        (("map.npz", "--out", "out.npz", "--weights", "nyu40.safetensors", "--up", "z"), "--by-name"),
-        (("map.npz", "--out", "out.npz", "--weights", "nesf.safetensors", "--up", "sideways"), "--up sideways"),
+        ("map.npz --out map.npz", "the result is made from it"),
+        ("missing.npz --out out.npz", "no such map"),
+        ("nesf.safetensors --out out.npz", "not a map"),
+        ("map.npz --out out.npz --weights field.safetensors", "weights of kind 'sray'"),
+        ("map.npz --out out.npz --weights nyu40.safetensors --up z", "--by-name"),
+        ("map.npz --out out.npz --weights nesf.safetensors --up sideways", "--up sideways"),
     ],
 )
-def test_bad_input_is_refused_in_one_line_and_nothing_is_written(
-    files: Path, options: tuple[str, ...], said: str
-) -> None:
-    names = [files / word if "." in word else word for word in options]
-    if "--weights" not in options:
-        names += ["--weights", files / "nesf.safetensors"]
-    done = run("refine", *names)
-    assert done.returncode == 1, done.stdout
-    assert said in error_line(done.stderr)
+def test_bad_input_is_refused_and_nothing_is_written(files: Path, words: str, said: str) -> None:
+    assert said in refused("refine", *(files / word if "." in word else word for word in words.split()))
     assert not (files / "out.npz").exists()

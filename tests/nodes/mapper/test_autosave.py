@@ -18,7 +18,7 @@ from semantic_mapper.nodes.mapper.saved_map import Autosave
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_paging import walk
 from tests.mapping.test_voxel_map import same
-from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_frames, run, write_config, write_log
+from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_frames, run_ok, write_config, write_log
 
 ALWAYS = 1e-9  # seconds
 
@@ -47,8 +47,7 @@ def test_a_killed_mapper_leaves_the_map_of_a_frame(weights: Path, tmp_path: Path
     assert first < saved.frames < 400 and saved.block_count > 2 * CHUNK_BLOCKS
     assert not (out / "summary.json").exists(), "nothing says that the results are whole"
     options = ("--weights", weights, "--config", config, "--max-frames", str(saved.frames))
-    done = run("replay", log, "--out", again, *options)
-    assert done.returncode == 0, done.stderr
+    run_ok("replay", log, "--out", again, *options)
     assert same(saved.block_state(), VoxelMap.load(again / "map.npz").block_state())
 
 

@@ -37,7 +37,7 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.mapping.test_correction import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import RawClient, a_folder
-from tests.nodes.support import CONFIG, eventually, node_here, run
+from tests.nodes.support import CONFIG, eventually, node_here, run, run_ok
 from tests.replay.test_corrected_poses import write as write_tum
 from tests.small import INTRINSICS, tiny_frames
 
@@ -193,8 +193,7 @@ def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
         assert robot.fused(8)
         far = dataclasses.replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**9)
         file = write_tum(tmp_path / "true.tum", [*frames[::2], far])
-        done = run("query", robot.query, "correct", file, "--json")
-        assert done.returncode == 0, done.stderr
+        done = run_ok("query", robot.query, "correct", file, "--json")
         outcome = json.loads(done.stdout)
         assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 1, False)
         far_file = write_tum(tmp_path / "far.tum", [far])

@@ -32,7 +32,7 @@ from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
-from tests.nodes.support import Running, error_line, eventually, node_here, repeated_frames, run, write_log
+from tests.nodes.support import Running, error_line, eventually, node_here, repeated_frames, run, run_ok, write_log
 from tests.nodes.test_faults import alone
 from tests.transport import samples
 
@@ -243,8 +243,7 @@ def test_running_launch_is_recorded_from_outside(tmp_path: Path) -> None:
         out = tmp_path / "out" / "a.mcap"
         wrong = run("record", out, "--launch", sockets, "--source", "ear")
         assert "--source ear: no node of alone.toml; there are eye" in error_line(wrong.stderr)
-        done = run("record", out, "--launch", sockets, "--duration", "1.5", "--split-s", "0.5", "--jpeg", "80")
-        assert done.returncode == 0, done.stderr
+        done = run_ok("record", out, "--launch", sockets, "--duration", "1.5", "--split-s", "0.5", "--jpeg", "80")
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0
     with open_log(out.parent) as found:
