@@ -16,8 +16,9 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, EXIT_USAGE, JsonOutput, SetOption, Settings, show_error, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.console import table as make_table
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.results import FleetComparison, LogChange, Rows, Tables, compare_stores
+from semantic_mapper.nodes.fleet.results import FleetComparison, Rows, Tables, compare_stores
 from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
@@ -82,9 +83,8 @@ def run(
             on_progress=lambda now: bar.set(now.over),
         )
     shown, failures = without_secrets(out), report.failures
-    output.print(
-        f"{shown}: {report.done} done, {report.existing} were there, {len(failures)} failed, of {report.total}"
-    )
+    counts = f"{report.done} done, {report.existing} were there, {len(failures)} failed, of {report.total}"
+    output.print(f"{shown}: {counts}")
     for failure in failures[:MAX_LOGS]:
         output.print(f"  failed: {failure.log}: {failure.error}")
     output.json({"store": shown, **msgspec.to_builtins(report)})
@@ -207,13 +207,10 @@ def merge(
 
 def _shown(rows: Rows) -> Table:
     """Rows for people; columns of numbers end at the right."""
-    values, found = rows.values[:MAX_SHOWN], Table()
-    for number, name in enumerate(rows.names):
-        numbers = values and all(isinstance(row[number], int | float | None) for row in values)
-        found.add_column(name, justify="right" if numbers else "left")
-    for row in values:
-        found.add_row(*map(_cell, row))
-    return found
+    values = rows.values[:MAX_SHOWN]
+    numeric = [all(isinstance(value, int | float | None) for value in column) for column in zip(*values, strict=True)]
+    numbers = [name for name, is_numeric in zip(rows.names, numeric, strict=False) if is_numeric]
+    return make_table([[_cell(value) for value in row] for row in values], rows.names, numbers=numbers)
 
 
 def _cell(value: Any) -> str:
@@ -225,17 +222,15 @@ def _cell(value: Any) -> str:
 def _show_comparison(output: Output, found: FleetComparison) -> None:
     direction = "lower" if found.lower_is_better else "higher"
     changed = [log for log in found.logs if log.status != "same"]
+    rows: list[tuple[Any, ...]] = []
+    for change in (*changed[:MAX_LOGS], found.mean):
+        difference = "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"
+        interval = "-" if (noise := change.estimate) is None else f"{noise.low:+.4f} .. {noise.high:+.4f}"
+        rows.append((change.log, change.a, change.b, difference, interval, f"{change.status} {change.reason}".strip()))
     names = ("log", "A", "B", "difference", "95 % interval", "")
-    rows = [_change_row(change) for change in (*changed[:MAX_LOGS], found.mean)]
     output.print(f"{found.operation}, {found.metric} ({direction} is better)", _shown(Rows(names, rows)))
     counts = ", ".join(f"{counted(found.count(status), 'log')} {status}" for status in ("worse", "better", "same"))
     output.print(f"{counts}; --json gives all")
     if unknown := sum(log.estimate is None and log.b is not None for log in found.logs):
         output.print(f"note: {counted(unknown, 'log')} without the same stretches in both: judged together only")
     output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
-
-
-def _change_row(change: LogChange) -> tuple[Any, ...]:
-    difference = "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"
-    interval = "-" if (found := change.estimate) is None else f"{found.low:+.4f} .. {found.high:+.4f}"
-    return change.log, change.a, change.b, difference, interval, f"{change.status} {change.reason}".strip()

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from semantic_mapper.errors import DependencyError, FleetError
+from semantic_mapper.errors import FleetError
+from semantic_mapper.nodes.fleet.store import fleet_package
 
 _CONNECT_TIMEOUT_S = 5.0
 _OBJECT_STORE_BYTES = 256 << 20  # tasks read and write files, and pass small values
@@ -45,12 +46,7 @@ def connected(address: str | None, *, cpus: int | None = None, worker_logs: bool
         cpus: Of the cluster of this machine; None = all that this process may use.
         worker_logs: Show on stderr what tasks print.
     """
-    try:
-        import ray
-    except ModuleNotFoundError as error:
-        raise DependencyError(
-            f'the fleet needs the package ray ({error}): pip install "semantic-mapper[fleet]"'
-        ) from error
+    ray = fleet_package("ray")
     is_local = address is None or _check_address(address)
     with contextlib.ExitStack() as stack:
         variables = _COMMON

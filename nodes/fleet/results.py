@@ -15,9 +15,10 @@ import msgspec
 import numpy as np
 import scipy  # loads `stats` when it is first used
 
-from semantic_mapper.errors import ConfigError, DependencyError
+from semantic_mapper.config import nearest
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import miou_of_sums
-from semantic_mapper.nodes.fleet.store import Store, TaskResult
+from semantic_mapper.nodes.fleet.store import Store, TaskResult, fleet_package
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 
@@ -50,12 +51,7 @@ class Tables:
     """
 
     def __init__(self, store: Store) -> None:
-        try:
-            import duckdb
-        except ModuleNotFoundError as error:
-            raise DependencyError(
-                f'tables of a fleet need the package duckdb ({error}): pip install "semantic-mapper[fleet]"'
-            ) from error
+        duckdb = fleet_package("duckdb")
         self._error = duckdb.Error
         self._database = duckdb.connect()
         kinds = {table: dict(columns) for table, columns in _COLUMNS.items()}
@@ -158,12 +154,7 @@ _LOWER_IS_BETTER = {
     *("unlabelled", "held_out_loss"),
 }
 # Of logs that have a score in A only, and those that are worse; the first ones are shown first.
-_BAD = {
-    "failed": "failed in B",
-    "missing": "missing in B",
-    "unscored": "without a score in B",
-    "worse": "lost more than",
-}
+_BAD = {"failed": "failed in B", "missing": "missing in B", "unscored": "without a score in B", "worse": "lost more"}
 
 
 class Estimate(msgspec.Struct, frozen=True):
@@ -237,9 +228,7 @@ def compare_stores(
         raise ConfigError(f"{store_a.shown} and {store_b.shown}: no log has results of `{operation}` in both")
     names = {name for result in a.values() for name, value in _values(result).items() if value is not None}
     if metric not in names:
-        raise ConfigError(
-            f"{store_a.shown}: no result has the metric {metric!r}; there are: {', '.join(sorted(names))}"
-        )
+        raise ConfigError(f"{store_a.shown}: no result has the metric {metric!r}{nearest(metric, sorted(names))}")
     if lower_is_better is None:
         costs = {"seconds", *(name for result in a.values() for name in result.findings.costs)}
         lower_is_better = metric in _LOWER_IS_BETTER or metric in costs

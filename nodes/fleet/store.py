@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -218,6 +219,14 @@ def _encode(record: Record) -> bytes:
     return msgspec.json.format(msgspec.json.encode(record), indent=1)
 
 
+def fleet_package(name: str) -> Any:
+    """A module of a package of the extra ``fleet``; ``DependencyError`` where it is not installed."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise DependencyError(f'a fleet needs more packages ({error}): pip install "semantic-mapper[fleet]"') from error
+
+
 # Paths and URLs
 
 
@@ -232,10 +241,7 @@ def open_url(url: str) -> tuple[Any, str]:
     Raises ConfigError: no such scheme, or no address. FleetError: a key, token or password in the URL. DependencyError:
     the extra ``fleet``, or the package for this scheme, is missing.
     """
-    try:
-        from fsspec.core import url_to_fs
-    except ModuleNotFoundError as error:
-        raise DependencyError(f'a fleet needs more packages ({error}): pip install "semantic-mapper[fleet]"') from error
+    url_to_fs = fleet_package("fsspec.core").url_to_fs
     place = re.split(r"[?#]", url, maxsplit=1)[0]
     if is_url(url) and without_secrets(place) != place:  # it would be in the shell's history and in the process table
         raise FleetError(

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 import semantic_mapper
-from semantic_mapper.config import Config, convert_config, load_config, nearest, parse_value, split_assignment
+from semantic_mapper.config import Config, assign, convert_config, load_config, nearest, parse_value, split_assignment
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.camera.ids import check_camera_ids
 from semantic_mapper.nodes.options import (
@@ -120,7 +120,7 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
 
     Args:
         path: Of the file.
-        settings: "NODE.OPTION=VALUE" or "SETTING=VALUE", see ``_Overrides``.
+        settings: "NODE.OPTION=VALUE" or "SETTING=VALUE", see ``_override``.
         out: The same as "out=DIR".
     """
     file = load_config(path, LaunchFile)
@@ -128,12 +128,12 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
     for name in names:
         if names.count(name) > 1 or not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
             raise ConfigError(f"{path}: node names must be unique words of letters, digits and _ -, got '{name}'")
-    overrides = _Overrides(file, path)
+    plain = copy.deepcopy(msgspec.to_builtins(file))
     for name, value in sorted(map(split_assignment, settings), key=lambda s: not s[0].endswith(".kind")):
-        overrides.apply(name, value)
+        _override(plain, name, value, path)
     if out is not None:
-        overrides.apply("out", str(out))
-    file = convert_config(overrides.plain, LaunchFile, str(path))
+        _override(plain, "out", str(out), path)
+    file = convert_config(plain, LaunchFile, str(path))
     folder = _name_start(file.out)
     nodes = tuple(
         msgspec.structs.replace(n, restart=n.restart or file.restart, options=_fill_in(n.options, folder))
@@ -149,60 +149,40 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
     return launch
 
 
-class _Overrides:
-    """Values that replace those of a launch file: of the launch ("out"), or of a node ("mapper.weights").
+def _override(plain: dict[str, Any], name: str, text: str, path: Path) -> None:
+    """Replace a value of a launch file: of the launch ("out"), or of a node ("mapper.weights").
 
     A camera's own settings need no further name in between: "camera.kind", "camera.config.fps", "camera.poses.kind".
     A `log` takes the place of a live camera, and is played in the time of its recording then; and the other way round.
     """
-
-    def __init__(self, file: LaunchFile, path: Path) -> None:
-        self.plain: dict[str, Any] = copy.deepcopy(msgspec.to_builtins(file))
-        self._nodes = {node["name"]: node for node in self.plain["node"]}
-        self._path = path
-
-    def apply(self, name: str, text: str) -> None:
-        """Replace a value. Raises ConfigError: nothing is called so; or it belongs into a table that is named as a
-        file."""
-        first, *keys = name.split(".")
-        node = self._nodes.get(first)
-        settings = [f for f in LaunchFile.__struct_fields__ if f != "node"]
-        if not keys and first in settings:
-            self.plain[first] = _typed(text, LaunchFile, first)
-        elif node is None or not keys:
-            raise self._unknown(f"no setting and no node is called '{first}'", first, [*settings, *self._nodes])
-        elif len(keys) == 1 and keys[0] in ("restart", "enabled"):
-            node[keys[0]] = _typed(text, NodeEntry, keys[0])
-        else:
-            self._set_option(node, keys, text)
-
-    def _set_option(self, node: dict[str, Any], keys: list[str], text: str) -> None:
-        table, kind = node["options"], OPTIONS[node["kind"]]
-        known = [*kind.__struct_fields__, "restart", "enabled"]
-        if kind is CameraOptions:
-            known += LiveCamera.__struct_fields__
-            if keys[0] in LiveCamera.__struct_fields__:
-                table.pop("log", None)
-                table, kind = table.setdefault("camera", {}), LiveCamera
-            elif keys == ["log"]:
-                table.pop("camera", None)
-                if self.plain["restart"] != "never":
-                    table.setdefault("mode", "realtime")
-        if keys[0] not in known:
-            raise self._unknown(f"node '{node['name']}' has no option '{keys[0]}'", keys[0], known)
-        *tables, last = keys
-        struct: type[msgspec.Struct] | None = kind
-        for key in tables:
-            struct = _struct_of(key, table)
-            table = table.setdefault(key, {})
-            if not isinstance(table, dict):
-                raise ConfigError(
-                    f"{self._path}: {node['name']}.{'.'.join(tables)} names the file {table!r}; set '{last}' there"
-                )
-        table[last] = _typed(text, struct, last)
-
-    def _unknown(self, what: str, name: str, names: Sequence[str]) -> ConfigError:
-        return ConfigError(f"{self._path}: {what}{nearest(name, names)}")
+    first, *keys = name.split(".")
+    nodes = {node["name"]: node for node in plain["node"]}
+    settings = [f for f in LaunchFile.__struct_fields__ if f != "node"]
+    if not keys and first in settings:
+        plain[first] = _typed(text, LaunchFile, first)
+        return
+    if not keys or first not in nodes:
+        known = [*settings, *nodes]
+        raise ConfigError(f"{path}: no setting and no node is called '{first}'{nearest(first, known)}")
+    node = nodes[first]
+    if keys in (["restart"], ["enabled"]):
+        node[keys[0]] = _typed(text, NodeEntry, keys[0])
+        return
+    table, kind = node["options"], OPTIONS[node["kind"]]
+    known = [*kind.__struct_fields__, "restart", "enabled"]
+    if kind is CameraOptions:
+        known += LiveCamera.__struct_fields__
+        if keys[0] in LiveCamera.__struct_fields__:
+            table.pop("log", None)
+            table, kind = table.setdefault("camera", {}), LiveCamera
+        elif keys == ["log"]:
+            table.pop("camera", None)
+            if plain["restart"] != "never":
+                table.setdefault("mode", "realtime")
+    if keys[0] not in known:
+        raise ConfigError(f"{path}: node '{first}' has no option '{keys[0]}'{nearest(keys[0], known)}")
+    struct = kind if len(keys) == 1 else _struct_of(keys[-2], table)
+    assign(table, ".".join(keys), _typed(text, struct, keys[-1]), f"{path}: node '{first}'")
 
 
 def _struct_of(key: str, camera: Mapping[str, Any]) -> type[msgspec.Struct] | None:

@@ -19,7 +19,7 @@ from rich.text import Text
 from semantic_mapper.config import MAX_FILE_BYTES
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import read_regular, write_bytes
-from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
+from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch, NodeEntry
 from semantic_mapper.nodes.process_folder import is_in_use, own_folders
 from semantic_mapper.plain_text import plain_without_secrets, visible
 from semantic_mapper.replay.summary import dig
@@ -36,19 +36,11 @@ LIVE = "live"  # on the command line: the mapper of the one launch that runs her
 QUERY_SOCKET = "query"  # where a mapper answers unless its launch file says otherwise
 
 
-class NodeNote(msgspec.Struct, frozen=True):
-    """One node, with all its options."""
-
-    name: str
-    kind: str
-    options: dict[str, Any]
-
-
 class LaunchNote(msgspec.Struct, frozen=True):
-    """The nodes of a launch, in the order of its file."""
+    """The nodes of a launch, with all their options, in the order of its file."""
 
     launch: str  # name of the file
-    nodes: tuple[NodeNote, ...]
+    nodes: tuple[NodeEntry, ...]
 
     def names(self, kind: str) -> tuple[str, ...]:
         """Nodes of a kind."""
@@ -58,7 +50,7 @@ class LaunchNote(msgspec.Struct, frozen=True):
 def leave_launch_note(launch: Launch, folder: Path) -> None:
     """Write the note of a launch into its folder, as it may stand in every recording."""
     options = plain_without_secrets(msgspec.to_builtins(launch.options))
-    nodes = tuple(NodeNote(n.name, n.kind, options[n.name]) for n in launch.nodes)
+    nodes = tuple(msgspec.structs.replace(n, options=options[n.name]) for n in launch.nodes)
     text = msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1)
     write_bytes(folder / NOTE, text, sync="none")
 

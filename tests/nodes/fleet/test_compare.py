@@ -116,7 +116,7 @@ def test_what_cannot_be_compared_says_what_there_is(compared: Any) -> None:
         compared(both, both)
     with pytest.raises(ConfigError, match="no log has results of `replay` in both"):
         compared([made_up(1)], [made_up(2)])
-    with pytest.raises(ConfigError, match="'moiu'; there are: blocks, frames_fused, iou:chair"):
+    with pytest.raises(ConfigError, match="'moiu'; did you mean `miou`"):
         compared(both, both, operation="eval", metric="moiu")
     with pytest.raises(ConfigError, match=r"\(--operation\): eval, replay"):
         compared(both, both, operation="finetune")

@@ -172,7 +172,11 @@ def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
         (["eyes.log=x"], ("", ""), "no node is called 'eyes'; did you mean `eye`?"),
         (["eye"], ("", ""), "--set eye: write NAME=VALUE"),
         (["eye.rate=fast"], ("", ""), "`rate`: must be a number, not a text"),
-        (["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"], ("", ""), "the file 'a.toml'; set 'fps' there"),
+        (
+            ["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"],
+            ("", ""),
+            "`config` is a value, not a table",
+        ),
         (["restart=on-failure", "eye.mode=fast"], ("", ""), "'eye' is to be restarted, but camera 'eye' waits"),
         (["restart=always"], ("", ""), "'always' is not valid"),
         ([], ('input = "eye"', 'input = "eyes"'), "did you mean `eye`?"),

@@ -22,7 +22,8 @@ from structlog.testing import capture_logs
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.info import describe_log
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, NodeNote, read_launch_note
+from semantic_mapper.nodes.launcher.launch_file import NodeEntry
+from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -135,7 +136,7 @@ def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -
 
 
 def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path, sockets: Path) -> None:
-    note = LaunchNote("kitchen.toml", (NodeNote("camera", "camera", {"log": "x"}),))
+    note = LaunchNote("kitchen.toml", (NodeEntry("camera", "camera", {"log": "x"}),))
     (sockets / NOTE).write_bytes(msgspec.json.encode(note))
     with streaming(tmp_path, sockets, split_mb=0.02, rgb="jpeg", jpeg_quality=90, reserve_mb=0) as stream:
         stream.publish(*range(10), *range(12, 30))
