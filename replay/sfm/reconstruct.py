@@ -15,6 +15,7 @@ import numpy as np
 
 from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.drivers.calibration import Rectifier, load_calibration
+from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
@@ -36,14 +37,15 @@ from semantic_mapper.replay.sfm.film import (
 )
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps
 from semantic_mapper.replay.sfm.scale import (
+    MIN_BOARD_CORNERS,
     NEIGHBOURS,
     UNSCALED_DEPTH_M,
-    BoardScale,
     Mark,
     ScaleHint,
     find_edges,
     marked_place,
     median_depth,
+    scale_by_board,
     scene_depth,
     upright,
     vertical,
@@ -223,7 +225,8 @@ class _Import:
         self._progress = on_progress
         self._notices: list[str] = []
         self._edges: dict[int, Float64] = {}  # of some of the picked frames
-        self._board = None if options.scale.board is None else BoardScale(options.scale.board)
+        self._board = None if options.scale.board is None else BoardFinder(options.scale.board)
+        self._board_seen: list[tuple[int, Float64, Float64]] = []  # frame, corners on the board, in the image
         self._look: FilmLook
 
     def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
@@ -252,7 +255,8 @@ class _Import:
             xy, descriptors = find_features(seen)
             np.savez(self._folder / colmap.FEATURES / f"{len(picked):06d}.npz", xy=xy, descriptors=descriptors)
             if self._board is not None:
-                self._board.look(frame.index, np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))
+                corners = self._board.find(np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))
+                self._board_seen += [(frame.index, *corners)] if len(corners[0]) >= MIN_BOARD_CORNERS else []
             if len(picked) % max(1, len(rows) // EDGE_FRAMES) == 0:
                 self._edges[frame.index] = find_edges(_gray(seen))
             counts.append(len(xy))
@@ -341,7 +345,7 @@ class _Import:
         if hint.factor is not None:
             return hint.factor, f"given: {hint.factor:g} m per unit"
         if self._board is not None:
-            return self._board.metres_per_unit(_poses(frames), seen)
+            return scale_by_board(self._board_seen, _poses(frames), seen)
         if hint.camera_height_m is not None:
             _, height = _floor_and_height(frames)
             if height is None:

@@ -32,8 +32,6 @@ TURNING = (
 def refuse_look(film: object, look: FilmLook, picks: int) -> None:
     """Raises ImportSourceError where the first look at a film shows that it is dark, still, or too short."""
     count = len(look.index)
-    if not count:
-        raise ImportSourceError(f"{film}: holds no frame that can be decoded; copy or convert it again")
     dark, seconds = float(look.dark.mean()), (look.stamp_ns[-1] - look.stamp_ns[0]) / 1e9
     if dark > MOST_DARK:
         raise ImportSourceError(

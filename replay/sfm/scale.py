@@ -6,14 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import msgspec
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from semantic_mapper.config import MapperConfig
-from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import camera_matrix
@@ -123,30 +123,23 @@ def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
     if len(rays) < 2:
         return None
     origins, directions = (np.stack(rows) for rows in zip(*rays, strict=True))
-    angle = np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1)))
-    if angle < MIN_ANGLE_DEG:
+    apart = directions @ directions.T < np.cos(np.radians(MIN_ANGLE_DEG))
+    if not apart.any():
         return None
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (N, 3, 3)
-    pairs = np.argwhere(np.triu(directions @ directions.T < np.cos(np.radians(MIN_ANGLE_DEG)), 1))
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (N, 3, 3) take what is square to each
+
+    def nearest(rows: Any) -> Float64:
+        return np.linalg.solve(across[rows].sum(axis=0), (across[rows] @ origins[rows, :, None]).sum(axis=0))[:, 0]
+
+    def meets(place: Float64) -> Bool:
+        """Which rays (N,) come near a place ahead of them."""
+        off = np.linalg.norm((across @ (place - origins)[:, :, None])[:, :, 0], axis=1)
+        return off < MAX_RAY_ERROR * ((place - origins) * directions).sum(axis=1)
+
+    pairs = np.argwhere(np.triu(apart, 1))
     chosen = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_RAY_PAIRS]]
-    places = [_nearest_to_rays(origins[pair], across[pair]) for pair in chosen]
-    place = max(places, key=lambda p: int((_ray_error(p, origins, across, directions) < MAX_RAY_ERROR).sum()))
-    good = _ray_error(place, origins, across, directions) < MAX_RAY_ERROR
-    if good.sum() < 2 or good.sum() < MIN_RAY_FRACTION * len(rays):
-        return None
-    return _nearest_to_rays(origins[good], across[good])
-
-
-def _nearest_to_rays(origins: Float64, across: Float64) -> Float64:
-    """(3,) of rays from (N, 3), ``across`` (N, 3, 3) taking what is square to each."""
-    return np.linalg.solve(across.sum(axis=0), (across @ origins[:, :, None]).sum(axis=0))[:, 0]
-
-
-def _ray_error(place: Float64, origins: Float64, across: Float64, directions: Float64) -> Float64:
-    """Distance of a place from each ray, of its distance from the camera; infinite for what lies behind it."""
-    off = np.linalg.norm((across @ (place - origins)[:, :, None])[:, :, 0], axis=1)
-    ahead = ((place - origins) * directions).sum(axis=1)
-    return np.where(ahead > 0, off / np.maximum(ahead, 1e-12), np.inf)
+    good = max((meets(nearest(pair)) for pair in chosen), key=lambda meeting: int(meeting.sum()))
+    return nearest(good) if good.sum() >= max(2, MIN_RAY_FRACTION * len(rays)) else None
 
 
 def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
@@ -157,43 +150,29 @@ def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -
     return T_world_camera[:3, 3], direction / np.linalg.norm(direction)
 
 
-class BoardScale:
-    """Collects the corners of a board over the film's frames, and tells the model's scale by them."""
+def scale_by_board(
+    seen: Sequence[tuple[int, Float64, Float64]], poses: Mapping[int, Float64], intrinsics: CameraIntrinsics
+) -> tuple[float, str]:
+    """Metres per unit by frames with poses T_world_camera that see a board, and a sentence on how it was found.
 
-    def __init__(self, board: BoardPoses) -> None:
-        self._finder = BoardFinder(board)
-        self._seen: list[tuple[int, Float64, Float64]] = []  # frame, corners on the board, in the image
-
-    def look(self, index: int, rgb: UInt8) -> None:
-        """Look for the board in a frame."""
-        points, pixels = self._finder.find(rgb)
-        if len(points) >= MIN_BOARD_CORNERS:
-            self._seen.append((index, points, pixels))
-
-    def metres_per_unit(self, poses: Mapping[int, Float64], intrinsics: CameraIntrinsics) -> tuple[float, str]:
-        """Scale by frames with poses T_world_camera, and a sentence on how it was found.
-
-        Raises ImportSourceError: the board was not seen from two sides by frames that have a pose.
-        """
-        rays: dict[tuple[float, ...], list[tuple[Float64, Float64]]] = {}
-        frames = 0
-        for index, points, pixels in self._seen:
-            if index in poses:
-                frames += 1
-                for point, xy in zip(points, pixels, strict=True):
-                    rays.setdefault(tuple(np.round(point, 6)), []).append(ray_of(poses[index], xy, intrinsics))
-        corners = {corner: place for corner, seen in rays.items() if (place := triangulate(seen)) is not None}
-        if len(corners) < MIN_BOARD_CORNERS:
-            raise ImportSourceError(
-                f"the board tells no scale: {frames} registered frames see it (of {len(self._seen)}), and "
-                f"{len(corners)} of its corners are seen from two sides, {MIN_BOARD_CORNERS} needed; film it larger "
-                "and walk past it, or give the scale in another way"
-            )
-        on_board, in_world = np.array(list(corners)), np.stack(list(corners.values()))
-        true = np.linalg.norm(on_board[:, None] - on_board[None], axis=2)
-        found = np.linalg.norm(in_world[:, None] - in_world[None], axis=2)
-        pairs = true > 0.5 * true.max()  # long ones are the most exact
-        return float(np.median(true[pairs] / found[pairs])), f"board: {len(corners)} corners in {frames} frames"
+    ``seen`` are frames, and the board's corners on the board and in the image. Raises ImportSourceError: it was not
+    seen from two sides by frames that have a pose.
+    """
+    rays: dict[tuple[float, ...], list[tuple[Float64, Float64]]] = {}
+    posed = [row for row in seen if row[0] in poses]
+    for index, points, pixels in posed:
+        for point, xy in zip(points, pixels, strict=True):
+            rays.setdefault(tuple(np.round(point, 6)), []).append(ray_of(poses[index], xy, intrinsics))
+    corners = {corner: place for corner, of in rays.items() if (place := triangulate(of)) is not None}
+    if len(corners) < MIN_BOARD_CORNERS:
+        raise ImportSourceError(
+            f"the board tells no scale: {len(posed)} registered frames see it (of {len(seen)}), and {len(corners)} of "
+            f"its corners are seen from two sides, {MIN_BOARD_CORNERS} needed; film it larger and walk past it, or "
+            "give the scale in another way"
+        )
+    true, found = (cdist(at, at) for at in (np.array(list(corners)), np.stack(list(corners.values()))))
+    pairs = true > 0.5 * true.max()  # long ones are the most exact
+    return float(np.median(true[pairs] / found[pairs])), f"board: {len(corners)} corners in {len(posed)} frames"
 
 
 def marked_place(
@@ -201,12 +180,8 @@ def marked_place(
 ) -> Float64:
     """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
 
-    Raises ImportSourceError: it cannot be followed.
-
-    Args:
-        marked: Index of the frame that it is a pixel of; one without a pose will do.
-        pictures: (H, W) gray pictures of this frame and of registered frames around it, by their index.
-        poses: T_world_camera (4, 4) of registered frames, by their index.
+    ``marked`` is the index of its frame, which may lack a pose, ``pictures`` (H, W) gray ones of this and of registered
+    frames around it, ``poses`` T_world_camera (4, 4) of those. Raises ImportSourceError: it cannot be followed.
     """
     order = sorted(pictures)
     at = order.index(marked)
@@ -218,19 +193,19 @@ def marked_place(
             if not true[0]:
                 break
             rays.append(ray_of(poses[now], xy[0, 0], intrinsics))
-    followed = len(rays)
     if marked in poses:
         rays.append(ray_of(poses[marked], np.array((mark.u, mark.v)), intrinsics))
     place = triangulate(rays)
     if place is None:
         raise ImportSourceError(
-            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be located: it is followed into {followed} "
-            "frames, from one side only; mark a corner with texture around it, at a time when the camera moves sideways"
+            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be located: {len(rays)} frames show it, from one "
+            "side only; mark a corner with texture around it, at a time when the camera moves sideways"
         )
     return place
 
 
 MIN_LENGTH = 0.06  # of an edge, of the image's width
+TRIALS = 2000  # of two edges each
 CONE_DEG = 40.0  # about the first guess: people hold cameras askew, and look down
 TOLERANCE_DEG = 1.5  # between an edge and the direction
 MIN_EDGES, MIN_SUPPORT = 40, 0.12  # of all edges' length: fewer upright ones are no evidence
@@ -248,11 +223,11 @@ def find_edges(gray: UInt8) -> Float64:
 def vertical(
     edges: Mapping[int, Float64], poses: Mapping[int, Float64], intrinsics: CameraIntrinsics, guess: Float64
 ) -> Float64 | None:
-    """Up (3,) in the world; None where too few edges agree.
+    """Up (3,) in the world by edges of some frames, their poses T_world_camera, and a rough ``guess`` (3,); None where
+    too few edges agree.
 
     An edge and its camera span a plane, in which the edge's direction lies. The direction is sought that lies in the
     planes of most edges, by their length.
-    ``edges`` are those of some frames, ``poses`` T_world_camera of frames, and ``guess`` (3,) is a rough up.
     """
     K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
     normals: list[Float64] = []
@@ -271,10 +246,12 @@ def vertical(
         """Which planes (N, D) directions (3, D) lie in."""
         return np.abs(planes @ directions) < np.sin(np.radians(TOLERANCE_DEG))
 
-    best = guess / np.linalg.norm(guess)
-    for cone_deg, step_deg in ((CONE_DEG, 1.5), (1.5, 0.25)):
-        directions = _cone(best, cone_deg, step_deg)
-        best = directions[int(np.argmax(weight @ near(directions.T)))]
+    guess = guess / np.linalg.norm(guess)
+    one, other = np.random.default_rng(0).choice(len(planes), (2, TRIALS), p=weight / weight.sum())
+    meeting = np.cross(planes[one], planes[other])
+    meeting *= np.sign(meeting @ guess)[:, None] / np.maximum(np.linalg.norm(meeting, axis=1), 1e-9)[:, None]
+    candidates = np.vstack((guess, meeting[meeting @ guess > np.cos(np.radians(CONE_DEG))]))
+    best = candidates[int(np.argmax(weight @ near(candidates.T)))]
     for _ in range(5):
         agree = near(best)
         if agree.sum() < 8:
@@ -282,16 +259,3 @@ def vertical(
         _, axes = np.linalg.eigh((planes[agree] * weight[agree, None]).T @ planes[agree])
         best = axes[:, 0] * np.sign(axes[:, 0] @ best)
     return best if weight[near(best)].sum() > MIN_SUPPORT * weight.sum() else None
-
-
-def _cone(axis: Float64, half_deg: float, step_deg: float) -> Float64:
-    """Unit directions (N, 3) within an angle of an axis, about a step apart; the axis comes first."""
-    side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    side /= np.linalg.norm(side)
-    rows = [axis]
-    for tilt in np.radians(np.arange(step_deg, half_deg + 1e-9, step_deg)):
-        count = max(6, int(np.ceil(2 * np.pi * np.sin(tilt) / np.radians(step_deg))))
-        turn = np.arange(count)[:, None] * 2 * np.pi / count
-        ring = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
-        rows += list(np.cos(tilt) * axis + np.sin(tilt) * ring)
-    return np.stack(rows)

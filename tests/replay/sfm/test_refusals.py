@@ -28,7 +28,6 @@ def look_of(motion: float, count: int = 60, dark: float = 0.0) -> FilmLook:
         (look_of(0.02, dark=0.9), 20, "^film.mp4: 90 % of its frames are black"),
         (look_of(0.0005), 1, "does not move"),
         (look_of(0.02, count=10), 5, "too short"),
-        (look_of(0.0, count=0), 0, "no frame"),
     ],
 )
 def test_the_first_look_refuses(look: FilmLook, picks: int, says: str) -> None:

@@ -6,16 +6,16 @@ import pytest
 
 from semantic_mapper.bundle.scale import floor_height
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
-from semantic_mapper.drivers.poses.board import make_board
+from semantic_mapper.drivers.poses.board import BoardFinder, make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import invert_pose, look_at, project, transform
 from semantic_mapper.replay.sfm.scale import (
-    BoardScale,
     Mark,
     fit_to_scene,
     marked_place,
     parse_distance,
+    scale_by_board,
     scene_depth,
     vertical,
 )
@@ -79,17 +79,17 @@ def board_view(T_board_camera: Float64, config: BoardPoses, camera: CameraIntrin
 def test_a_board_tells_the_scale() -> None:
     config = BoardPoses()
     camera = CameraIntrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
-    scale, scaled, poses = BoardScale(config), 3.0, {}
+    finder, seen, scaled, poses = BoardFinder(config), [], 3.0, {}
     middle = np.array((0.14, 0.1, 0.0))
     for n in range(5):
         T = look_at(middle + np.array((0.12 * (n - 2), 0.05 * n, -0.5)), middle, np.array((0.0, -1.0, 0.0)))
-        scale.look(n, board_view(T, config, camera))
+        seen.append((n, *finder.find(board_view(T, config, camera))))
         poses[n] = T.copy()
         poses[n][:3, 3] /= scaled
-    found, how = scale.metres_per_unit(poses, camera)
+    found, how = scale_by_board(seen, poses, camera)
     assert found == pytest.approx(scaled, rel=0.01) and "board" in how
     with pytest.raises(ImportSourceError, match="board tells no scale"):
-        scale.metres_per_unit({0: poses[0]}, camera)
+        scale_by_board(seen, {0: poses[0]}, camera)
 
 
 def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng: np.random.Generator) -> None:
