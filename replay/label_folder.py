@@ -23,6 +23,7 @@ from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.replay.importers.base import BadFrameError, read_label
 from semantic_mapper.replay.importers.folder import read_label_set
 from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.replay.run_folder import prepare_folder
 from semantic_mapper.types import PosedFrame, UInt8
 
 LABELS_FILE = "labels.json"
@@ -88,14 +89,13 @@ class LabelFolder:
         """
         channels = self.label_set.to_channels(label, f"label image of frame {number}")
         there = self._files().get(number, self.path / f"{number:06d}.png")
-        if (channels >= 0).any():
-            _, data = cv2.imencode(".png", np.ascontiguousarray(label))
-            write_bytes(there, data.tobytes(), raises=LogError)
-            return
         try:
-            there.unlink(missing_ok=True)
+            if (channels >= 0).any():
+                write_bytes(there, cv2.imencode(".png", np.ascontiguousarray(label))[1].tobytes())
+            else:
+                there.unlink(missing_ok=True)
         except OSError as error:
-            raise LogError(f"{there}: cannot be removed: {error.strerror or error}") from error
+            raise LogError(f"{there}: cannot be changed: {error.strerror or error}") from error
 
     def _files(self) -> dict[int, Path]:
         files = sorted(self.path.glob("*.png"))
@@ -105,10 +105,8 @@ class LabelFolder:
 def open_label_folder(path: Path, log: Log) -> LabelFolder:
     """Label images of a log's frames, to be read.
 
-    Raises:
-        LabelError: nobody knows what they mean.
-        LogError: they are missing, or of another log, or of frames that it does not have.
-        ImportSourceError: an invalid labels.json.
+    Raises LabelError: nobody knows what they mean. LogError: they are missing, or of another log, or of frames that it
+    does not have. ImportSourceError: an invalid labels.json.
     """
     label_set = log.info.label_set
     if (path / LABELS_FILE).exists():
@@ -128,12 +126,9 @@ def open_label_folder(path: Path, log: Log) -> LabelFolder:
 def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
     """A folder to write label images of a log to: a new one, or one with labels of the same log, to go on with.
 
-    A folder that is there may have fewer classes than ``label_set``, with the same ids.
-
-    Raises:
-        LogError: it holds labels of another log, or cannot be made.
-        LabelError: it holds labels of other classes.
-        ImportSourceError: its labels.json is invalid.
+    A folder that is there may have fewer classes than ``label_set``, with the same ids. Raises LogError: it holds
+    labels of another log. ConfigError: it cannot be made. LabelError: it holds labels of other classes.
+    ImportSourceError: its labels.json is invalid.
     """
     folder = LabelFolder(path, label_set)
     if (path / LABELS_FILE).exists():
@@ -147,10 +142,7 @@ def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
             )
     elif folder.numbers():
         raise LogError(f"{path}: has images, but no labels.json that says what they are; choose another folder")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be made: {error.strerror or error}; choose another folder") from error
+    prepare_folder(path)
     data = plain_labels(label_set) | {"log": msgspec.to_builtins(log_identity(log))}
     write_bytes(path / LABELS_FILE, json.dumps(data, indent=1, ensure_ascii=False).encode(), raises=LogError)
     return folder
@@ -182,10 +174,7 @@ def plain_labels(label_set: LabelSet) -> dict[str, Any]:
 
 
 def _check_log(path: Path, log: Log) -> None:
-    try:
-        named = read_json(path / LABELS_FILE, _NamedLog).log
-    except ConfigError as error:
-        raise LogError(str(error)) from error
+    named = read_json(path / LABELS_FILE, _NamedLog).log
     here = log_identity(log)
     if named is not None and (named.frames, named.digest) != (here.frames, here.digest):
         raise LogError(f"{path}: holds labels of another log, {named.name} ({named.frames} frames); give that one")

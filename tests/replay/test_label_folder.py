@@ -102,7 +102,7 @@ def test_what_nobody_can_know_is_refused(log: LogReader, tmp_path: Path) -> None
     with pytest.raises(ImportSourceError, match=r"labels\.json"):
         open_label_folder(images, log)
     (images / "file").write_text("")
-    with pytest.raises(LogError, match="cannot be made"):
+    with pytest.raises(ConfigError, match="choose another folder"):
         make_label_folder(images / "file" / "labels", log, ROOMS)
 
 
