@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -23,25 +23,16 @@ from semantic_mapper.mapping.formats import write_ply
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scale_name, voxel_size_text
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.graph import SceneGraph, find_graph
+from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.replay.overview import ViewStrip, draw_overview, draw_strip
-from semantic_mapper.replay.page import (
-    Section,
-    picture,
-    picture_files,
-    point_view,
-    stage_sections,
-    table_of,
-    write_page,
-)
+from semantic_mapper.replay.page import Section, picture, point_view, table_of, write_page
 from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.session import MAX_LISTED, LatencyHistogram, MapSession
 from semantic_mapper.replay.summary import SUMMARY_FILE, describe_depth, notes, percent, summary_table
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float64, UInt8
 
 _log = get_logger(__name__)
 
-ItemT = TypeVar("ItemT")
 OVERVIEW_FRAMES = 2
 # Surface points that a map has at least for each of its blocks, else it is nearly empty. With sensor depth they are 25
 # to 33 in the demo, 64 where a flat surface goes through each; with rendered depth that does not agree 0 to 1.
@@ -85,7 +76,7 @@ def finish_session(
     progress()
     write_ply(out / "map.ply", points, session.pipeline.label_set, scale_known=voxel_map.scale_known)
     progress()
-    summary = {**build_summary(session, points), **session.more_summary()}
+    summary = {**_summarize(session, points), **session.more_summary()}
     summary |= {"stopped_by": stopped_by or None, "restarted": restarted or None}
     if summary["map"]["nearly_empty"]:
         _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
@@ -93,41 +84,37 @@ def finish_session(
     progress()
     graph = find_graph(voxel_map)
     progress()
-    _draw_overview(session, points, graph, summary, out / OVERVIEW_NAME)
+    unit = "m" if voxel_map.scale_known else "units"
+    poses = [f.T_world_camera for f, _ in session.snapshots]
+    up = camera_up(np.stack(poses)) if poses else None
+    size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
+    overview = draw_overview(
+        list(_view_strips(session, OVERVIEW_FRAMES)),
+        points,
+        session.pipeline.label_set,
+        title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
+        subtitle="; ".join(_subtitles(session, summary)),
+        up=up,
+        unit=unit,
+        rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
+    )
+    write_picture(out / OVERVIEW_NAME, overview)
     if session.rerun is not None:
         progress()
         session.rerun.finish(points, graph)
     progress()
-    _write_report(session, points, summary, out)
+    _write_report(session, points, overview, up, unit, summary, out)
     progress()
     return summary
 
 
 def clear_results(out: Path) -> None:
     """Remove what an earlier run left next to its map: next to a new map, it would be of another one."""
-    for name in ("summary.json", "map.ply", "overview.png", "report.html", "eval.json", "eval.html"):
+    for name in (SUMMARY_FILE, "map.ply", OVERVIEW_NAME, REPORT_NAME, "eval.json", "eval.html"):
         (out / name).unlink(missing_ok=True)
 
 
-def _draw_overview(
-    session: MapSession, points: MapPoints, graph: SceneGraph | None, summary: Mapping[str, Any], path: Path
-) -> None:
-    voxel_map = session.pipeline.voxel_map
-    size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
-    picture = draw_overview(
-        view_strips(session, OVERVIEW_FRAMES),
-        points,
-        session.pipeline.label_set,
-        title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle="; ".join(_said(session, summary)),
-        up=map_up(session),
-        unit=picture_unit(session),
-        rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
-    )
-    write_picture(path, picture)
-
-
-def _said(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]:
+def _subtitles(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]:
     """What is to be known of a picture of the map: what is wrong, its score, and where depth comes from."""
     if summary["pose_check"]["warning"]:
         yield "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)"
@@ -141,37 +128,28 @@ def _said(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"depth: {describe_depth(summary['depth'])}"
 
 
-def picture_unit(session: MapSession) -> str:
-    """Unit of lengths in pictures of a session."""
-    return "m" if session.pipeline.voxel_map.scale_known else "units"
-
-
-def map_up(session: MapSession) -> Float64 | None:
-    """Rough up (3,) of a session's world by the poses of its frames; None without a frame."""
-    poses = [f.T_world_camera for f, _ in session.snapshots]
-    return camera_up(np.stack(poses)) if poses else None
-
-
-def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
+def _view_strips(session: MapSession, count: int) -> Iterator[ViewStrip]:
     """Frames of a session with what was rendered for them, at most ``count``, evenly spread."""
-    strips: list[ViewStrip] = []
-    for frame, update in _spread(session.snapshots, count):
+    kept = session.snapshots
+    for index in np.linspace(0, len(kept) - 1, min(count, len(kept))).round().astype(int):
+        frame, update = kept[index]
         truth = None
         if session.truth is not None and frame.label is not None:
             truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
-        strips.append(
-            ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m, frame.depth_m is None)
-        )
-    return strips
+        yield ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m, frame.depth_m is None)
 
 
-def nearly_empty(session: MapSession, points: int) -> str | None:
+def _nearly_empty(session: MapSession, points: int) -> str | None:
     """Why a map of this many surface points has hardly any for the space that its frames measured, and what to do; None
     where it has, or where no frame had depth to map."""
     blocks = session.pipeline.voxel_map.block_count
     mapped = max(session.fused, session.computed_depth)  # a camera that stands still fuses nothing
     if not mapped or (points and points >= MIN_POINTS_A_BLOCK * blocks):
         return None
+    why = (
+        "their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
+        "(T_world_camera, metres, stamped with the time of capture)"
+    )
     if 2 * session.without_depth >= mapped:
         why = (
             f"{session.without_depth} of them have no sensor depth, and depth that the field renders does not agree "
@@ -185,23 +163,11 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
             "with views that overlap; it needs exact poses (T_world_camera, metres, stamped with the time of capture), "
             "rectified, sharp images and surfaces with texture"
         )
-    else:
-        why = (
-            "their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
-            "(T_world_camera, metres, stamped with the time of capture)"
-        )
     return f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {mapped} frames; {why}"
 
 
-def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
-    """At most ``count`` items, evenly spread, first and last among them."""
-    if len(items) <= count:
-        return list(items)
-    return [items[int(i)] for i in np.linspace(0, len(items) - 1, count).round()]
-
-
-def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
-    """The summary of a session as plain data."""
+def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
+    """The summary as plain data."""
     pipeline, bundle = session.pipeline, session.bundle
     voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
     refusals = sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)
@@ -246,7 +212,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
             "corrected_poses": session.corrected_poses,
-            "nearly_empty": nearly_empty(session, len(points.xyz)),
+            "nearly_empty": _nearly_empty(session, len(points.xyz)),
             "unfinished_correction": session.unfinished_correction or None,
         },
         "metrics": _metrics(session, points),
@@ -320,30 +286,31 @@ def versions() -> dict[str, str]:
     return found | {name: metadata.version(name) for name in PACKAGES}
 
 
-def _write_report(session: MapSession, points: MapPoints, summary: Mapping[str, Any], out: Path) -> None:
-    """Write ``report.html`` to the folder of a replay, with what is there already."""
-    label_set, unit = session.pipeline.label_set, picture_unit(session)
-    overview = out / OVERVIEW_NAME, "Frames, what was rendered for them, and the map from above and aside"
+def _write_report(
+    session: MapSession,
+    points: MapPoints,
+    overview: UInt8,
+    up: Float64 | None,
+    unit: str,
+    summary: Mapping[str, Any],
+    out: Path,
+) -> None:
+    label_set = session.pipeline.label_set
+    caption = "Frames, what was rendered for them, and the map from above and aside"
     strips = [
         picture(draw_strip(s, label_set, unit), f"{s.name}: camera, and what was rendered for it", photo=True)
-        for s in view_strips(session, STRIPS)
+        for s in _view_strips(session, STRIPS)
     ]
-    counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
     refused = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in summary["refusals"]]
     sections = [
         Section(notes=notes(summary)),
-        Section("The map", view=point_view(points, label_set, map_up(session)) if len(points.xyz) else None),
-        Section("Overview", pictures=list(picture_files(overview))),
+        Section("The map", view=point_view(points, label_set, up) if len(points.xyz) else None),
+        Section("Overview", pictures=[picture(overview, caption, photo=True)]),
         Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
         Section("Frames", pictures=strips),
-        *stage_sections({"this replay": summary}),
         Section(
-            "Frames that came, and what became of them",
-            notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
-            tables=[table_of(("frames", ""), counts)],
-        ),
-        Section(
-            f"Refused, the first {MAX_LISTED}",
+            f"Refused and damaged, the first {MAX_LISTED}",
+            notes=summary["damaged_stretches"],
             tables=[table_of(("seq", "stamp, ns", "reason"), refused)] if refused else [],
         ),
         Section(

@@ -7,14 +7,12 @@ What was rendered is marked in each frame (``PosedFrame.label_is_pseudo``, ``dep
 from __future__ import annotations
 
 import hashlib
-import shutil
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import msgspec
@@ -23,7 +21,7 @@ import numpy as np
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, LabelError, LogError, WeightsError
 from semantic_mapper.fields.scene.panoptic import Panoptic
-from semantic_mapper.files import write_bytes, write_json
+from semantic_mapper.files import atomic_folder, write_bytes, write_json
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -34,6 +32,7 @@ from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.format import LogWriter, atomic_log
 from semantic_mapper.replay.log.reader import PART_ATTACHMENT, LogReader, Part
 from semantic_mapper.replay.log.sequence import Log, open_log, part_path, parts_on_disk
+from semantic_mapper.replay.run_folder import prepare_folder
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -57,17 +56,18 @@ class AutolabelRequest:
     min_confidence: float = 0.0  # pixels that are less sure are unknown
     overwrite_labels: bool = False  # replace labels that are there, too
     max_frames: int = 0  # 0 = all
-    instances: Path | None = None  # folder for images of things, of weights that have boxes
+    # new folder for images of things, of weights that have boxes: ``CAMERA/NNNNNN.png`` (uint16 box ids, 0 = none),
+    # and ``instances.json``: each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN")
+    instances: Path | None = None
 
 
 class AutolabelReport(NamedTuple):
-    """What was written: the new log or its parts, who has labelled it with which figures, frames that could not be
-    rendered (they are there without a label) with the reason, and what could not be read (and is not there)."""
+    """What was written."""
 
-    files: tuple[Path, ...]
-    note: AutolabelNote
-    unlabelled: tuple[str, ...]
-    damage: tuple[str, ...]
+    files: tuple[Path, ...]  # the new log or its parts
+    note: AutolabelNote  # who has labelled it, with which figures
+    unlabelled: tuple[str, ...]  # frames that could not be rendered (they are there without a label), with the reason
+    damage: tuple[str, ...]  # what could not be read (and is not there)
 
 
 def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) -> AutolabelReport:
@@ -77,9 +77,9 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
     ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Nothing is left of the new log, nor
     of images of things, where this raises ConfigError: the new log would lie among the parts of the old one.
-    LabelError: labels stay whose classes are not those of the weights. LogError: the log cannot be read, the new one is
-    there already or cannot be written, or no frame could be rendered. WeightsError: there are no such weights, or they
-    tell no classes apart. KeyboardInterrupt: it was stopped.
+    LabelError: labels stay whose classes are not those of the weights. LogError: the log cannot be read, what is to be
+    written is there already or cannot be written, or no frame could be rendered. WeightsError: there are no such
+    weights, or they tell no classes apart. KeyboardInterrupt: it was stopped.
     """
     monitor = monitor or JobMonitor()
     with open_log(request.logs) as log, ExitStack() as stack:
@@ -88,15 +88,19 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
             raise ConfigError(
                 f"{request.out}: lies in the folder of the log's parts, and would be read as one; choose another folder"
             )
-        for number, there in parts_on_disk(request.out).items():
-            if number < len(readers):
-                raise LogError(f"{there}: exists already; remove it or choose another name")
+        there = [path for number, path in parts_on_disk(request.out).items() if number < len(readers)]
+        things: Path | None = None
+        if (folder := request.instances) is not None:
+            there += [folder] if folder.exists() else []
+        if there:
+            raise LogError(f"{there[0]}: exists already; remove it or choose another name")
         bundle = _load(request, log)
         label_set = _label_set(log, bundle.label_set, request)
         bundle.voxel_map.note_scale(log.info.scale_known)
-        labeller = _Labeller(bundle, label_set, request)
-        if labeller.instances is not None:
-            stack.callback(labeller.instances.close)
+        if folder is not None:
+            prepare_folder(folder.parent)
+            things = stack.enter_context(atomic_folder(folder, raises=LogError))
+        labeller = _Labeller(bundle, label_set, request, things)
         settings = f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
         name = hashlib.sha256(f"{labeller.digest} {settings}".encode()).hexdigest()[:8]
         monitor.start(min(len(log), request.max_frames or len(log)))
@@ -123,8 +127,6 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
             writer.flush()
         damage = tuple(str(error) for reader in readers for error in reader.errors)
         files = tuple(part_path(request.out, number) for number in range(len(writers)))
-        if labeller.instances is not None:
-            labeller.instances.finish()
     return AutolabelReport(files, note, tuple(labeller.refused), damage)
 
 
@@ -199,9 +201,12 @@ class _Message:
 
 
 class _Labeller:
-    """Renders frames and writes messages in the order in which they came; frames may wait for later ones."""
+    """Renders frames and writes messages in the order in which they came; frames may wait for later ones.
 
-    def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest) -> None:
+    ``things`` is the folder for images of things.
+    """
+
+    def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest, things: Path | None) -> None:
         self._bundle, self._pipeline, self._request = bundle, bundle.pipeline, request
         self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))  # of the labels to write
         self._ignore_id = np.uint8(label_set.ignore_id)
@@ -212,9 +217,9 @@ class _Labeller:
         self.count = dict.fromkeys(("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written"), 0)
         self.rendered = 0
         self.refused: list[str] = []  # why frames could not be rendered
-        model, self.instances = bundle.checkpoint.model, None
-        if request.instances is not None and isinstance(model, Panoptic):
-            self.instances = InstanceImages(request.instances, model)
+        self._things = things
+        self._boxed = bundle.checkpoint.model if isinstance(bundle.checkpoint.model, Panoptic) else None
+        self._thing_pixels: dict[int, dict[str, int]] = {}  # by the id of a thing, by frame
 
     def push(self, message: _Message) -> None:
         """Take a message."""
@@ -226,11 +231,19 @@ class _Labeller:
         self._write_ready()
 
     def finish(self) -> None:
-        """Write what still waits."""
+        """Write what still waits, and the list of things."""
         for frame in self._pipeline.prepare_rest():
             self._render(frame)
         self._write_ready()
         assert not self._queue, "a frame was lost on its way"
+        if self._things is not None and self._boxed is not None:
+            listed = [
+                {"id": b.id, "class": b.class_name, "box": msgspec.to_builtins(b)}
+                | {"pixels": self._thing_pixels.get(b.id, {})}
+                for b in self._boxed.shape.boxes
+                if b.thing
+            ]
+            write_json(self._things / INSTANCES_FILE, {"instances": listed})
 
     def note(self) -> AutolabelNote:
         """Figures so far."""
@@ -281,9 +294,15 @@ class _Labeller:
             self._pixels += int(sure.sum())
             self._all_pixels += sure.size
             self._confidence += float(update.confidence[sure].sum(dtype=np.float64))
-        if self.instances is not None:
+        if self._things is not None and self._boxed is not None:
             unknown = np.uint8(self._bundle.label_set.ignore_id)
-            self.instances.add(message.number, frame, np.where(confident, update.label, unknown))
+            ids = thing_image(self._boxed, frame, np.where(confident, update.label, unknown)).instance
+            name = f"{frame.camera_id}/{message.number:06d}"
+            path = self._things / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, cv2.imencode(".png", ids)[1].tobytes())
+            for thing, count in zip(*np.unique(ids[ids > 0], return_counts=True), strict=True):
+                self._thing_pixels.setdefault(int(thing), {})[name] = int(count)
         if self._request.depth and not message.envelope.has_depth and frame.depth_sigma_m is not None:
             self._add_depth(message, frame)
 
@@ -308,8 +327,8 @@ class _Labeller:
 
     def _add_depth(self, message: _Message, frame: PosedFrame) -> None:
         """Computed depth and its spread."""
-        assert frame.depth_m is not None and frame.depth_sigma_m is not None
         depth_m, sigma_m = frame.depth_m, frame.depth_sigma_m
+        assert depth_m is not None and sigma_m is not None
         if self._pipeline.voxel_map.scale_known:
             depth_m, sigma_m = _rounded(depth_m, np.rint), _rounded(sigma_m, np.ceil)
         if depth_m.any():
@@ -328,56 +347,3 @@ def _rounded(metres: Float32, how: Callable[[Float32], Float32]) -> Float32:
     steps = how(metres * np.float32(DEPTH_STEPS_PER_M))
     held = np.where(np.isfinite(steps) & (steps >= 0) & (steps <= np.iinfo(np.uint16).max), steps, 0)
     return held.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
-
-
-class InstanceImages:
-    """Writes images of things, ``CAMERA/NNNNNN.png``: uint16 ids of boxes, 0 = none; none is there before ``finish``.
-
-    ``instances.json`` has each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN"). ``folder``: new, or of an
-    earlier run, whose images of the same frames are replaced. ``field``: whose boxes they are of. Raises LogError: the
-    folder cannot be made.
-    """
-
-    def __init__(self, folder: Path, field: Panoptic) -> None:
-        self._folder, self._field = folder, field
-        self._pixels: dict[int, dict[str, int]] = {b.id: {} for b in field.shape.boxes if b.thing}
-        self._new = not folder.exists()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
-        except OSError as error:
-            raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from error
-
-    def add(self, number: int, frame: PosedFrame, label: UInt8) -> None:
-        """Write the things of a frame, by its number in the log; ``label`` (H, W) says where their classes are.
-        Raises LogError: it cannot be written."""
-        ids = thing_image(self._field, frame, label).instance
-        name = f"{frame.camera_id}/{number:06d}"
-        path = self._unfinished / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, cv2.imencode(".png", ids)[1].tobytes(), raises=LogError)
-        for thing, count in zip(*np.unique(ids[ids > 0], return_counts=True), strict=True):
-            self._pixels[int(thing)][name] = int(count)
-
-    def finish(self) -> None:
-        """Put all images in place, then the list of things.
-        Raises LogError: they cannot be written."""
-        things: list[dict[str, Any]] = [
-            {"id": b.id, "class": b.class_name, "box": msgspec.to_builtins(b), "pixels": self._pixels[b.id]}
-            for b in self._field.shape.boxes
-            if b.thing
-        ]
-        try:
-            for image in sorted(self._unfinished.rglob("*.png")):
-                place = self._folder / image.relative_to(self._unfinished)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                image.replace(place)
-            write_json(self._folder / INSTANCES_FILE, {"instances": things})
-        except OSError as error:
-            raise LogError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
-
-    def close(self) -> None:
-        """Remove what was not finished, and the folder if it is new and empty."""
-        shutil.rmtree(self._unfinished, ignore_errors=True)
-        if self._new and not any(self._folder.iterdir()):
-            self._folder.rmdir()

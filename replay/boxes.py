@@ -130,12 +130,13 @@ def load_boxes(path: Path) -> BoxFile:
     return found
 
 
-def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFile, LabelSet]:
+def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path, source: str) -> tuple[BoxFile, LabelSet]:
     """Boxes that a field can be fitted with, and the label set of the field: that of the pseudo labels, and classes of
     boxes that one of its classes stands for, as ``merge`` says, or else ``MERGE``.
 
-    Boxes of XML of any other class that it lacks are left out, with a warning. ``path`` is the file, for errors. Raises
-    ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
+    Boxes of XML of any other class that it lacks are left out, with a warning. ``path`` is the file, and ``source``
+    where pseudo labels come from, for errors. Raises ConfigError: the label set lacks a class, with the file, the id of
+    the box, and the nearest name; or no box is left.
     """
     names = {*label_set.names, *(name for others in boxes.merge.values() for name in others)}
     lacking = {p.class_name for p in boxes.primitives} - names
@@ -160,8 +161,14 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
     for where, name, among in named:
         if name not in among.names:
             near = get_close_matches(name, among.names, n=1, cutoff=0.5)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; it has {', '.join(among.names)}"
-            raise ConfigError(f"{path}, {where}: label set '{label_set.name}' has no class '{name}'{hint}")
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(among.names)}."
+            raise ConfigError(
+                f"{path}, {where}: label set '{label_set.name}' has no class '{name}'; {hint} Pseudo labels are "
+                f"{source}: correct the classes of the boxes, say in `merge` of the file which class of the labels "
+                "stands for it, or give other labels or weights (--pseudo)"
+            )
+    if not boxes.primitives:
+        raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
     return boxes, known
 
 
@@ -198,70 +205,29 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
     return replace(boxes, primitives=tuple(kept)), dropped
 
 
-def _metres(value: Any, name: str) -> Float64:
-    array = np.array(value, np.float64)
-    if not (np.abs(array) <= MAX_TRANSLATION_M).all():
-        raise ConfigError(f"{name} must be metres within {MAX_TRANSLATION_M / 1000:g} km")
-    return array
-
-
-def _box_of(box: Primitive) -> Primitive:
-    """A primitive whose outline or mesh is one, with the origin of its axes in its middle."""
-    if not 1 <= box.id <= MAX_ID:
-        raise ConfigError(f"id must be a whole number from 1 to {MAX_ID}, got {box.id}")
-    if not (box.size >= MIN_SIZE_M).all():
-        raise ConfigError(f"size must be at least {MIN_SIZE_M} m along all axes, got {box.size.tolist()}")
-    for name, known in (("stamps", box.stamps), ("frames", box.frames)):
-        for when, pose in known or ():
-            check_pose(pose, f"{name}, pose at {when}", "box")
-    check_pose(box.T_world_box, "T_world_box", "box")
-    box = centred(box)
-    box.mesh()
-    return box
-
-
 def _parse_all(
-    entries: Iterable[tuple[int, Any]], parse: Callable[[Any], Primitive], id_of: Callable[[Any], int | None]
-) -> tuple[dict[int, Primitive], dict[int, str]]:
-    """Boxes by their number in the file, and for those that cannot be used a sentence that says why."""
-    good: dict[int, Primitive] = {}
-    bad: dict[int, str] = {}
+    entries: Iterable[tuple[int, Any]], as_json: Callable[[Any], Any]
+) -> tuple[tuple[Primitive, ...], tuple[str, ...]]:
+    """Boxes by their number in the file, and for those that cannot be used a sentence that says why; ``as_json`` gives
+    an entry of ``boxes.json``."""
+    good: list[Primitive] = []
+    bad: list[str] = []
     first: dict[int, int] = {}
-    for number, entry in entries:
+    for number, given in entries:
+        entry: Any = None
         try:
-            box = parse(entry)
+            box = _read_box(entry := as_json(given))
             if box.frames is None and first.setdefault(box.id, number) != number:
                 raise ConfigError(f"id {box.id} is that of box {first[box.id]}; give it another")
-            good[number] = box
+            good.append(box)
         except (ConfigError, PoseError) as error:
-            known = id_of(entry)
-            bad[number] = f"box {number}{'' if known is None else f' (id {known})'}: {error}"
-    return good, bad
+            known: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
+            bad.append(f"box {number}{f' (id {known})' if type(known) is int else ''}: {error}")
+    return tuple(good), tuple(bad)
 
 
-def _read_json(text: bytes, path: Path) -> BoxFile:
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
-        raise ConfigError(f"{path} is neither JSON nor XML: {reason:.200}") from error
-    table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
-    of_query = table.get("question") == "instances"
-    if of_query:
-        table = {"boxes": table.get("instances"), "merge": table.get("merge", {})}
-    elif not get_close_matches("boxes", table, n=1):
-        raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
-    file = convert_config(table, _File, str(path))
-    good, bad = _parse_all(enumerate(file.boxes, 1), _from_query if of_query else _from_json, _id_in_json)
-    return BoxFile(tuple(good.values()), file.merge, bad=tuple(bad.values()))
-
-
-def _id_in_json(entry: Any) -> int | None:
-    found: Any = cast("dict[str, Any]", entry).get("id") if isinstance(entry, dict) else None
-    return found if type(found) is int else None
-
-
-def _from_json(entry: Any) -> Primitive:
+def _read_box(entry: Any) -> Primitive:
+    """An entry of ``boxes.json``, whose outline or mesh is one, with the origin of its axes in its middle."""
     box = convert_config(entry, _Box, "its values")
     if box.stamps and box.frames:
         raise ConfigError("has stamps and frames; give one of them")
@@ -280,22 +246,24 @@ def _from_json(entry: Any) -> Primitive:
         if len(polygon) < 3:
             raise ConfigError(f"polygon must have at least 3 different corners, got {len(polygon)}")
         size = np.array([*np.ptp(polygon, axis=0), size[2]])
+    if not (size >= MIN_SIZE_M).all():
+        raise ConfigError(f"size must be at least {MIN_SIZE_M} m along all axes, got {size.tolist()}")
     stamps, frames = _poses(box.stamps, "stamps"), _poses(box.frames, "frames")
-    return _box_of(
-        Primitive(
-            id=box.id,
-            class_name=box.class_name,
-            shape=box.shape,
-            T_world_box=(stamps or frames or ((0, np.array(box.T_world_box, np.float64)),))[0][1],
-            size=size,
-            thing=box.class_name not in BOX_STUFF if box.thing is None else box.thing,
-            polygon=polygon,
-            vertices=vertices,
-            faces=faces,
-            stamps=stamps,
-            frames=frames,
-        )
+    pose = (stamps or frames or ((0, np.array(box.T_world_box, np.float64)),))[0][1]
+    check_pose(pose, "T_world_box", "box")
+    thing = box.class_name not in BOX_STUFF if box.thing is None else box.thing
+    made = centred(
+        Primitive(box.id, box.class_name, box.shape, pose, size, thing, polygon, vertices, faces, stamps, frames)
     )
+    made.mesh()
+    return made
+
+
+def _metres(value: Any, name: str) -> Float64:
+    array = np.array(value, np.float64)
+    if not (np.abs(array) <= MAX_TRANSLATION_M).all():
+        raise ConfigError(f"{name} must be metres within {MAX_TRANSLATION_M / 1000:g} km")
+    return array
 
 
 def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, Float64], ...] | None:
@@ -305,16 +273,35 @@ def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, 
     poses = {when: np.array(pose, np.float64) for when, pose in known}
     if not poses or len(poses) < len(known):
         raise ConfigError(f"{name} must be [[whole number, 4x4 pose], ...], each number once")
+    for when, pose in poses.items():
+        check_pose(pose, f"{name}, pose at {when}", "box")
     return tuple(sorted(poses.items()))
 
 
-def _from_query(entry: Any) -> Primitive:
+def _read_json(text: bytes, path: Path) -> BoxFile:
+    try:
+        data: Any = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+        raise ConfigError(f"{path} is neither JSON nor XML: {reason:.200}") from error
+    table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
+    of_query = table.get("question") == "instances"
+    if of_query:
+        table = {"boxes": table.get("instances"), "merge": table.get("merge", {})}
+    elif not get_close_matches("boxes", table, n=1):
+        raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
+    file = convert_config(table, _File, str(path))
+    good, bad = _parse_all(enumerate(file.boxes, 1), _from_query if of_query else lambda entry: entry)
+    return BoxFile(good, file.merge, bad=bad)
+
+
+def _from_query(entry: Any) -> dict[str, Any]:
     """One instance of `query MAP instances`."""
     thing = convert_config(entry, _Instance, "an instance, as `query MAP instances` writes it")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.array(thing.box.R_world_box), thing.box.center
     size = [metres + 2 * QUERY_MARGIN_M for metres in thing.box.size]
-    return _from_json({"id": thing.id, "class": thing.class_name, "T_world_box": pose.tolist(), "size": size})
+    return {"id": thing.id, "class": thing.class_name, "T_world_box": pose.tolist(), "size": size}
 
 
 def _read_xml(text: bytes, path: Path) -> BoxFile:
@@ -330,64 +317,53 @@ def _read_xml(text: bytes, path: Path) -> BoxFile:
     nodes = [node for node in root if node.find("transform") is not None]
     if not nodes:
         raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
-    known = [(n, node) for n, node in enumerate(nodes, 1) if not _text(node, "label").lower().startswith("unknown")]
-    good, bad = _parse_all(known, _from_node, _id_in_xml)
-    place: dict[tuple[str, str], int] = {}  # of the first node of an object that moves
-    for number, node in known:
-        if number in good and (later := good[number]).frames is not None:
-            first = place.setdefault(_object_of(node), number)
-            if first != number:
-                box = good[first]  # in the shape that it had at first
-                frames = tuple(sorted({**dict(later.frames or ()), **dict(box.frames or ())}.items()))
-                good[first] = replace(box, frames=frames, T_world_box=frames[0][1])
-                del good[number]
-    return BoxFile(
-        tuple(good.values()), left_out=len(nodes) - len(known), bad=tuple(bad[n] for n in sorted(bad)), is_xml=True
-    )
+    objects: dict[Any, tuple[int, list[ElementTree.Element]]] = {}  # each with the number of its first node
+    left_out = 0
+    for number, node in enumerate(nodes, 1):
+        label, instance = _text(node, "label"), _text(node, "instanceId")
+        if label.lower().startswith("unknown"):
+            left_out += 1
+        elif not _moves(node):
+            objects[number] = number, [node]
+        else:
+            what = label, instance if instance.strip("0") else f"index {_text(node, 'index')}"
+            objects.setdefault(what, (number, []))[1].append(node)
+    good, bad = _parse_all(objects.values(), _from_nodes)
+    return BoxFile(good, left_out=left_out, bad=bad, is_xml=True)
 
 
-def _from_node(node: ElementTree.Element) -> Primitive:
-    """One object in axes of its own, with its pose at a frame if it moves."""
-    transform, local, faces = (_matrix(node, name) for name in ("transform", "vertices", "faces"))
-    if transform.shape != (4, 4) or local.shape[1] != 3 or faces.shape[1] not in (3, 4):
-        shapes = f"{transform.shape}, {local.shape} and {faces.shape}"
-        raise ConfigError(f"transform must be 4 x 4, vertices N x 3 and faces N x 3 or N x 4, got {shapes}")
-    if (faces != np.round(faces)).any() or (faces < 0).any() or (faces > 1e9).any():
-        raise ConfigError("faces must be whole numbers: those of the vertices of each, from 0")
-    u, _, v = np.linalg.svd(_metres(transform, "transform")[:3, :3])  # the nearest rotation to a matrix that may scale
-    pose = np.eye(4)
-    pose[:3, :3] = u @ np.diag((1, 1, -1 if np.linalg.det(u @ v) < 0 else 1)) @ v
-    pose[:3, 3] = transform[:3, 3]
-    vertices = _metres(local, "vertices") @ (pose[:3, :3].T @ transform[:3, :3]).T
-    label = _text(node, "label")
-    if not label:
-        raise ConfigError("<label> is missing")
-    name = _XML_NAMES.get(re.sub(r"\s", "", label).lower(), label)
-    corners = faces.astype(np.int64)
-    frame = _whole(node, "timestamp") if _text(node, "timestamp") else -1  # it does not move
-    box = Primitive(
-        id=_whole(node, "index") + 1,
-        class_name=name,
-        shape="mesh",
-        T_world_box=pose,
-        size=np.ptp(vertices, axis=0),
-        thing=name not in BOX_STUFF,
-        vertices=vertices,
-        faces=corners if corners.shape[1] == 3 else np.concatenate((corners[:, :3], corners[:, (0, 2, 3)])),
-    )
-    box = _box_of(box)
-    return box if frame < 0 else replace(box, frames=((frame, box.T_world_box),))
+def _from_nodes(nodes: list[ElementTree.Element]) -> dict[str, Any]:
+    """One object in axes of its own, in the shape that it had at first."""
+    vertices, faces = (_matrix(nodes[0], name) for name in ("vertices", "faces"))
+    if vertices.shape[1] != 3 or faces.shape[1] not in (3, 4):
+        raise ConfigError(f"vertices must be N x 3, faces N x 3 or N x 4, got {vertices.shape} and {faces.shape}")
+    if (faces == np.round(faces)).all() and (np.abs(faces) < 1e9).all():
+        faces = faces.astype(np.int64)
+    transform, pose = np.eye(4), np.eye(4)
+    frames: dict[int, list[list[float]]] = {}
+    for node in reversed(nodes):
+        transform = _matrix(node, "transform")
+        if transform.shape != (4, 4):
+            raise ConfigError(f"transform must be 4 x 4, got {transform.shape}")
+        u, _, v = np.linalg.svd(transform[:3, :3])  # the nearest rotation to a matrix that may scale
+        pose = transform.copy()
+        pose[3] = 0, 0, 0, 1
+        pose[:3, :3] = u @ np.diag((1, 1, -1 if np.linalg.det(u @ v) < 0 else 1)) @ v
+        frames[_whole(node, "timestamp") if _moves(node) else -1] = pose.tolist()
+    label = _text(nodes[0], "label")
+    return {
+        "id": _whole(nodes[0], "index") + 1,
+        "class": _XML_NAMES.get(re.sub(r"\s", "", label).lower(), label),
+        "shape": "mesh",
+        "T_world_box": pose.tolist(),
+        "vertices": (vertices @ (pose[:3, :3].T @ transform[:3, :3]).T).tolist(),
+        "faces": [*faces[:, :3].tolist(), *(faces[:, (0, 2, 3)].tolist() if faces.shape[1] == 4 else ())],
+        "frames": sorted(frames.items()) if _moves(nodes[0]) else None,
+    }
 
 
-def _id_in_xml(node: ElementTree.Element) -> int | None:
-    index = _text(node, "index")
-    return int(index) + 1 if index.isdecimal() else None
-
-
-def _object_of(node: ElementTree.Element) -> tuple[str, str]:
-    """What nodes of one object have in common; without a number of the instance, the index."""
-    instance = _text(node, "instanceId")
-    return _text(node, "label"), instance if instance.strip("0") else f"index {_text(node, 'index')}"
+def _moves(node: ElementTree.Element) -> bool:
+    return _text(node, "timestamp") not in ("", "-1")
 
 
 def _text(node: ElementTree.Element, name: str) -> str:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -34,8 +34,8 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import FrameDepth
-from semantic_mapper.replay.autolabel_note import AutolabelNote, read_note
-from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_classes, with_times
+from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.boxes import load_boxes, with_classes, with_times
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -51,9 +51,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 FrameKey = tuple[str, int]  # camera and stamp
 ItemT = TypeVar("ItemT")
-LEAST_KEYFRAMES = 2
 MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
-OWN = "the log's own label images"
 _log = get_logger(__name__)
 
 
@@ -61,54 +59,43 @@ _log = get_logger(__name__)
 class FinetuneRequest:
     """What to finetune, and on what."""
 
-    log: Path  # the log
+    log: Path
     out: Path  # weights to write
     # how many labelled frames to use; 0 for a kind that learns no classes, and for all frames that the folder
     # ``labels`` has labels of
     keyframes: int = 0
     config: FinetuneConfig = field(default_factory=FinetuneConfig)  # of the training
-    # weights, from_scratch: Weights to start from, None = those in the package; or random ones.
-    weights: Path | None = None
-    from_scratch: bool = False
+    weights: Path | None = None  # to start from; None = those in the package
+    from_scratch: bool = False  # start from random ones
     # where the frames' depth comes from
     depth: DepthConfig = field(default_factory=lambda: DepthConfig(source="sensor"))
     kind: str | None = None  # of a field that is fitted to one scene, from nothing; None = that of the weights
     labels: Path | None = None  # folder of label images in place of the log's
-    frames: Sequence[int] = ()  # numbers in the log of the labelled frames, in place of ``keyframes``
-    # boxes, pseudo, uncovered: Of the kind "panoptic": file of boxes, folder or weights of pseudo labels, and what is
-    # outside of all boxes.
-    boxes: Path | None = None
-    pseudo: str | None = None
-    uncovered: str = "stuff"
+    boxes: Path | None = None  # kind "panoptic": file of boxes
+    pseudo: str | None = None  # kind "panoptic": folder or weights of pseudo labels
+    uncovered: str = "stuff"  # kind "panoptic": what is outside of all boxes
     strokes: bool = False  # label images are strokes, and grow
 
 
-class FinetuneResult(NamedTuple):
-    """The weights, as written (``recipe`` holds the figures), and the numbers in the log of the labelled frames."""
+def finetune_log(request: FinetuneRequest, monitor: JobMonitor | None = None) -> tuple[Checkpoint, list[int]]:
+    """Finetune on keyframes of a log and write the weights: after a stop request, the best so far. Returns them
+    (``recipe`` holds the figures), and the numbers in the log of the labelled frames.
 
-    checkpoint: Checkpoint
-    chosen: list[int]
-
-
-def finetune_log(request: FinetuneRequest, monitor: JobMonitor | None = None) -> FinetuneResult:
-    """Finetune on keyframes of a log and write the weights: after a stop request, the best so far.
     Raises LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong, and what to do.
-    KeyboardInterrupt: a stop request came before anything was learned."""
+    KeyboardInterrupt: a stop request came before anything was learned.
+    """
     monitor = monitor or JobMonitor()
     if request.out.resolve() == request.log.resolve():
         raise ConfigError(f"{request.out}: is the log itself; choose another name for the weights")
     if request.out.is_file() and request.out.suffix != ".safetensors":
         raise ConfigError(f"{request.out}: is there, and no weights file; give --out a name that ends in .safetensors")
     prepare_file(request.out)
-    if request.boxes is not None:
-        result = _finetune_boxes(request, load_boxes(request.boxes), request.boxes, monitor)
-    else:
-        result = _finetune_labels(request, monitor)
-    save_checkpoint(result.checkpoint, request.out)
-    return result
+    made = _finetune_labels(request, monitor) if request.boxes is None else _finetune_boxes(request, monitor)
+    save_checkpoint(made[0], request.out)
+    return made
 
 
-def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> FinetuneResult:
+def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Checkpoint, list[int]]:
     # First, so that a wrong path does not cost the reading of a log.
     nothing = request.from_scratch or request.kind is not None
     start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
@@ -118,69 +105,73 @@ def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> FinetuneR
     with open_log(request.log) as log:
         folder = None if request.labels is None else open_label_folder(request.labels, log)
         label_set = log.info.label_set if folder is None else folder.label_set
-        if label_set is None and (request.keyframes or request.frames):
+        if label_set is None and request.keyframes:
             raise LabelError(
                 f"{request.log}: has no label images; finetuning needs labelled keyframes. Make some with "
                 "`semantic-mapper label LOG --serve`, and give their folder with --labels"
             )
         label_set = label_set or ROOMS
-        source = FrameSource(log, folder, request, _compute_depths(log, request.depth, monitor))
+        source = FrameSource(log, folder, request, monitor, _compute_depths(log, request.depth, monitor))
         by_number: dict[int, PosedFrame] = {}
-        if request.frames:
-            by_number = source.named()
-        elif request.keyframes or folder is not None:  # a folder without a number: all that it has
-            by_number = source.choose_labelled(label_set, monitor)
+        if request.keyframes or folder is not None:  # a folder without a number: all that it has
+            by_number = source.choose_labelled(label_set)
         frames = list(by_number.values())
-        pseudo = sum(f.label_is_pseudo for f in frames)
-        grown: dict[str, float] = {}
-        if request.strokes:
-            grown["painted"] = labelled_fraction(frames, label_set)
-            frames = [grow_strokes(frame, label_set) for frame in frames]
-            grown["grown"] = labelled_fraction(frames, label_set)
-        if kind in FITTERS:
-            frames += source.unlabelled(frames, monitor)
+        recipe: dict[str, Any] = {}
         note = read_note(log.attachments())
-    seen = frozenset[int]() if start is None else start.train_stamps_ns
-    model = None if start is None else start.model
-    checkpoint = _fit(kind, frames, label_set, model, seen, note, request, monitor)
-    if pseudo:
-        checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
-    if grown:
-        checkpoint.recipe["strokes"] = grown
-    return FinetuneResult(checkpoint, list(by_number))
+        if pseudo := sum(f.label_is_pseudo for f in frames):
+            recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
+        if request.strokes:
+            painted = labelled_fraction(frames, label_set)
+            frames = [grow_strokes(frame, label_set) for frame in frames]
+            recipe["strokes"] = {"painted": painted, "grown": labelled_fraction(frames, label_set)}
+        if kind in FITTERS:
+            frames += source.unlabelled(frames)
+    model, seen = (None, frozenset[int]()) if start is None else (start.model, start.train_stamps_ns)
+    if note is not None and any(f.label_is_pseudo for f in frames):
+        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
+    checkpoint = _fit(request, monitor, frames, label_set, model, seen, kind)
+    checkpoint.recipe.update(recipe)
+    return checkpoint, list(by_number)
 
 
-def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, path: Path, monitor: JobMonitor) -> FinetuneResult:
+def _finetune_boxes(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Checkpoint, list[int]]:
     """A field of kind "panoptic"."""
+    assert request.boxes is not None
+    boxes = load_boxes(request.boxes)
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
-        boxes, label_set = match_boxes(boxes, path, labels)
-        boxes, dropped = with_times(boxes, path, log)
-        source = FrameSource(log, None, request, _compute_depths(log, request.depth, monitor))
-        frames = source.pseudo_labelled(labels, monitor)
+        boxes, label_set = with_classes(boxes, labels.label_set, request.boxes, labels.source)
+        boxes, dropped = with_times(boxes, request.boxes, log)
+        source = FrameSource(log, None, request, monitor, _compute_depths(log, request.depth, monitor))
+        frames = source.pseudo_labelled(labels)
         note = read_note(log.attachments())
-    start, unseen = boxed_field(boxes, usable_frames(frames), label_set, request.uncovered)
-    checkpoint = _fit(Panoptic.kind, frames, label_set, start, labels.train_stamps_ns, note, request, monitor)
+    in_view = boxes_in_view(boxes.primitives, usable_frames(frames))
+    config = PanopticConfig(
+        boxes=tuple(box_config(p) for p, there in zip(boxes.primitives, in_view, strict=True) if there),
+        merge=dict(boxes.merge),
+        uncovered="empty" if request.uncovered == "empty" else "stuff",
+    )
+    seen = labels.train_stamps_ns
+    if note is not None and any(f.label_is_pseudo for f in frames):
+        seen |= frozenset(note.train_stamps_ns)
+    checkpoint = _fit(request, monitor, frames, label_set, Panoptic(config, label_set), seen, Panoptic.kind)
     figures = checkpoint.recipe["panoptic"]
-    figures |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
+    figures |= {"left_out": boxes.left_out, "unseen": int((~in_view).sum()), "pseudo": labels.source}
     figures["lost"] += len(dropped)
-    return FinetuneResult(checkpoint, [])
+    return checkpoint, []
 
 
 def _fit(
-    kind: str,
+    request: FinetuneRequest,
+    monitor: JobMonitor,
     frames: list[PosedFrame],
     label_set: LabelSet,
     start: LearnedField | None,
     seen: frozenset[int],
-    note: AutolabelNote | None,
-    request: FinetuneRequest,
-    monitor: JobMonitor,
+    kind: str,
 ) -> Checkpoint:
     """Fit, with progress."""
     monitor.start(100)
-    if note is not None and any(f.label_is_pseudo for f in frames):
-        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
 
     def on_progress(progress: FitProgress) -> None:
         note = f"step {progress.step}"
@@ -196,16 +187,6 @@ def _fit(
         raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
     return checkpoint
-
-
-def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:
-    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed"."""
-    if config.source not in ("auto", "computed"):
-        return {}
-    if config.source == "auto" and next(iter(log)).depth_m is not None:
-        return {}
-    monitor.start(len(log))
-    return compute_depths(log, config, lambda done: _go_on(monitor, done, "computing depth from pictures"))
 
 
 class ComputedFrame(NamedTuple):
@@ -226,6 +207,14 @@ class ComputedFrame(NamedTuple):
         return replace(frame, depth_m=depth, depth_sigma_m=sigma, T_world_camera=self.T_world_camera)
 
 
+def _compute_depths(log: Log, config: DepthConfig, monitor: JobMonitor) -> Mapping[FrameKey, ComputedFrame]:
+    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed"."""
+    if config.source not in ("auto", "computed") or (config.source == "auto" and next(iter(log)).depth_m is not None):
+        return {}
+    monitor.start(len(log))
+    return compute_depths(log, config, lambda done: _go_on(monitor, done, "computing depth from pictures"))
+
+
 def compute_depths(
     frames: Iterable[PosedFrame], config: DepthConfig, on_frame: Callable[[int], None]
 ) -> dict[FrameKey, ComputedFrame]:
@@ -234,7 +223,12 @@ def compute_depths(
     Frames whose pictures nothing can be computed from (dark, blurred, standing still) are left out, with a line in the
     log. No map gives hints, so depth is a little less exact than in ``replay``. ``config.source`` is "auto" or
     "computed"; ``on_frame`` is called with the number of frames that are read."""
-    computer, found = FrameDepth(config, _no_hint), dict[FrameKey, ComputedFrame]()
+
+    def no_hint(_: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
+        empty = np.zeros((intrinsics.height, intrinsics.width), np.float32)
+        return empty, empty > 0
+
+    computer, found = FrameDepth(config, no_hint), dict[FrameKey, ComputedFrame]()
 
     def keep(ready: Iterable[PosedFrame]) -> None:
         for frame in ready:
@@ -253,11 +247,6 @@ def compute_depths(
     return found
 
 
-def _no_hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
-    empty = np.zeros((intrinsics.height, intrinsics.width), np.float32)
-    return empty, empty > 0
-
-
 def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
     """Report progress."""
     monitor.set(done, note)
@@ -267,32 +256,23 @@ def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FrameSource:
-    """The frames of a log as a request has them: labels of the folder before the log's, with the requested depth."""
+    """The frames of a log as a request has them: labels of the folder before the log's, with the requested depth.
+
+    All that read many raise KeyboardInterrupt: a stop request came.
+    """
 
     log: Log
     folder: LabelFolder | None
     request: FinetuneRequest
+    monitor: JobMonitor
     computed: Mapping[FrameKey, ComputedFrame]
 
-    def named(self) -> dict[int, PosedFrame]:
-        """The labelled frames that the request names, by number in the log.
-        Raises LogError: the log has no such frame, or it has no label image."""
-        frames: dict[int, PosedFrame] = {}
-        for number in sorted(set(self.request.frames)):
-            frame = self._labelled(number) if number < len(self.log) else None
-            if frame is None or frame.label is None:
-                raise LogError(
-                    f"{self.request.log}: has no frame {number} with a label image; it has {len(self.log)}. Give "
-                    "labels in a folder with --labels"
-                )
-            frames[number] = self._with_depth(frame)
-        return frames
+    def choose_labelled(self, label_set: LabelSet, least: int = 2) -> dict[int, PosedFrame]:
+        """The labelled frames that show most of what the log shows, by number in it; without a number of them, all.
 
-    def choose_labelled(self, label_set: LabelSet, monitor: JobMonitor) -> dict[int, PosedFrame]:
-        """The labelled frames that show most of what the log shows, by number in it.
-
-        Of a log whose depth is computed, frames that it could be computed for. Without a number of keyframes, all.
-        Raises LogError: fewer usable labelled frames than requested. KeyboardInterrupt: a stop request came."""
+        Of a log whose depth is computed, frames that it could be computed for. Raises LogError: fewer usable labelled
+        frames than requested, or than ``least``.
+        """
         sizes: set[tuple[int, int]] = set()
 
         def read(number: int) -> Candidate | None:
@@ -309,9 +289,9 @@ class FrameSource:
             return None if self.computed and len(candidate.cells) == 0 else candidate  # the camera had not moved yet
 
         readable = range(len(self.log)) if self.folder is None else self.folder.numbers()
-        candidates = dict(self._each(readable, read, monitor, "choosing keyframes"))
+        candidates = dict(self._each(readable, read, "choosing keyframes"))
         count, numbers = self.request.keyframes, list(candidates)
-        if len(numbers) < (count or LEAST_KEYFRAMES):
+        if len(numbers) < (count or least):
             more = f"--keyframes {count} is more than that" if count else "finetuning needs two"
             where = self.request.log if self.folder is None else self.folder.path
             raise LogError(f"{where}: {len(numbers)} of the {len(self.log)} frames have usable labels; {more}")
@@ -320,9 +300,8 @@ class FrameSource:
             numbers = [numbers[i] for i in chosen]
         return {number: self._with_depth(self._labelled(number)) for number in numbers}
 
-    def unlabelled(self, labelled: list[PosedFrame], monitor: JobMonitor) -> list[PosedFrame]:
-        """The other frames of the log at working width, without labels: as many as requested, evenly spread.
-        Raises KeyboardInterrupt: a stop request came."""
+    def unlabelled(self, labelled: list[PosedFrame]) -> list[PosedFrame]:
+        """The other frames of the log at working width, without labels: at most ``MAX_SCENE_FRAMES``, evenly spread."""
         known = {(f.camera_id, f.stamp_ns) for f in labelled}
 
         def read(number: int) -> PosedFrame | None:
@@ -331,14 +310,15 @@ class FrameSource:
                 return None
             return anchor_from_frame(replace(self._with_depth(frame), label=None), self.request.config.width)
 
-        numbers = sorted(set(_evenly(range(len(self.log)), MAX_SCENE_FRAMES)))
-        return [frame for _, frame in self._each(numbers, read, monitor, "reading frames")]
+        numbers = _evenly(range(len(self.log)), MAX_SCENE_FRAMES)
+        return [frame for _, frame in self._each(numbers, read, "reading frames")]
 
-    def pseudo_labelled(self, labels: PseudoLabels, monitor: JobMonitor) -> list[PosedFrame]:
-        """Frames at working width with their pseudo labels, as many as requested; see ``choose_frames``.
+    def pseudo_labelled(self, labels: PseudoLabels) -> list[PosedFrame]:
+        """Frames at working width with their pseudo labels, at most ``MAX_SCENE_FRAMES``; see ``choose_frames``.
 
         A frame whose label image is missing or cannot be used gives its colours alone; these are counted.
-        Raises LogError: no frame has a pseudo label. KeyboardInterrupt: a stop request came."""
+        Raises LogError: no frame has a pseudo label.
+        """
         reasons: list[str] = []
 
         def read(number: int) -> PosedFrame:
@@ -354,21 +334,21 @@ class FrameSource:
             return replace(small, label_is_pseudo=labelled.label_is_pseudo and labelled.label is not None)
 
         numbers = choose_frames(len(self.log), MAX_SCENE_FRAMES, labels.numbers)
-        frames = [frame for _, frame in self._each(numbers, read, monitor, "reading frames and pseudo labels")]
+        frames = [frame for _, frame in self._each(numbers, read, "reading frames and pseudo labels")]
         if not any(f.label is not None for f in frames):
             raise LogError(f"{self.log.path}: no frame has a pseudo label ({reasons[0] if reasons else labels.source})")
         if reasons:
             _log.warning("frames_without_pseudo_label", count=len(reasons), reason=reasons[0])
-        return [labels.once_all_are_seen(frame) for frame in frames]
+        return [labels.of_map(frame) for frame in frames]
 
     def _each(
-        self, numbers: Sequence[int], read: Callable[[int], ItemT | None], monitor: JobMonitor, note: str
+        self, numbers: Sequence[int], read: Callable[[int], ItemT | None], note: str
     ) -> Iterator[tuple[int, ItemT]]:
         """What is read of frames; those that cannot be used are left out, with a warning that counts them."""
         reasons: list[str] = []
-        monitor.start(len(numbers))
+        self.monitor.start(len(numbers))
         for done, number in enumerate(numbers, 1):
-            _go_on(monitor, done, note)
+            _go_on(self.monitor, done, note)
             try:
                 found = read(number)
             except (LogError, FrameError, LabelError) as error:
@@ -385,51 +365,61 @@ class FrameSource:
 
     def _with_depth(self, frame: PosedFrame) -> PosedFrame:
         """The frame with the depth that it is trained with."""
-        source = self.request.depth.source
-        if frame.depth_sigma_m is not None:  # the log's depth is no sensor's
-            if source in ("off", "sensor"):
-                frame = replace(frame, depth_m=None, depth_sigma_m=None)
-        elif source in ("off", "computed") and frame.depth_m is not None:
-            frame = replace(frame, depth_m=None)
+        wanted = ("auto", "computed") if frame.depth_sigma_m is not None else ("auto", "sensor")
+        if frame.depth_m is not None and self.request.depth.source not in wanted:
+            frame = replace(frame, depth_m=None, depth_sigma_m=None)
         found = self.computed.get((frame.camera_id, frame.stamp_ns))
         return frame if frame.depth_m is not None or found is None else found.on(frame)
 
 
 @dataclass(frozen=True, slots=True)
 class PseudoLabels:
-    """Where label images come from."""
+    """Where label images come from: a folder, the map that weights make of the frames, or else the frames."""
 
     label_set: LabelSet  # of them
-    # the frame, by number in the log, with its pseudo label, or without a label
-    of: Callable[[PosedFrame, int], PosedFrame]
     source: str  # for people
     numbers: frozenset[int] | None = None  # frames that have one; None = all
-    train_stamps_ns: frozenset[int] = frozenset()  # frames whose true labels those who made them have learned from
-    # a frame and its label, once ``of`` has seen all of them
-    once_all_are_seen: Callable[[PosedFrame], PosedFrame] = lambda frame: frame
+    folder: LabelFolder | None = None
+    mapper: Mapper | None = None
+
+    @property
+    def train_stamps_ns(self) -> frozenset[int]:
+        """Frames whose true labels those who made them have learned from."""
+        return frozenset() if self.mapper is None else self.mapper.checkpoint.train_stamps_ns
+
+    def of(self, frame: PosedFrame, number: int) -> PosedFrame:
+        """A frame, by its number in the log, with its pseudo label, or without a label."""
+        if self.folder is not None:
+            return replace(self.folder.labelled(frame, number), label_is_pseudo=True)
+        if self.mapper is None:
+            return frame
+        label = self.mapper.step(replace(frame, label=None, label_is_pseudo=False)).label
+        return replace(frame, label=label, label_is_pseudo=True)
+
+    def of_map(self, frame: PosedFrame) -> PosedFrame:
+        """A frame, once ``of`` has seen all, with the labels of the map, and its own where the map has none: many views
+        err less than one."""
+        if self.mapper is None or frame.label is None:
+            return frame
+        seen = self.mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label
+        return replace(frame, label=np.where(seen == self.mapper.label_set.ignore_id, frame.label, seen))
 
 
 def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
     """The pseudo labels of a log.
-    ``log``: the log. ``pseudo``: folder of label images, or weights; None = the log's own label images, else the
-    shipped weights. Raises LabelError, LogError, WeightsError: they cannot be read."""
+    ``pseudo``: folder of label images, or weights; None = the log's own label images, else the shipped weights. Raises
+    LabelError, LogError, WeightsError: they cannot be read."""
     if pseudo is not None and Path(pseudo).is_dir():
         folder = open_label_folder(Path(pseudo), log)
-        source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
-        return PseudoLabels(
-            folder.label_set, lambda f, n: replace(folder.labelled(f, n), label_is_pseudo=True), source, numbers
-        )
+        return PseudoLabels(folder.label_set, f"the folder {pseudo}", frozenset(folder.numbers()), folder)
     if pseudo is None and log.info.label_set is not None:
         numbers = frozenset(n for n, (envelope, _) in enumerate(log.frame_parts()) if envelope.has_label)
         if numbers:
-            return PseudoLabels(log.info.label_set, lambda frame, _: frame, OWN, numbers)
+            return PseudoLabels(log.info.label_set, "the log's own label images", numbers)
     mapper = Mapper.load(pseudo)
     mapper.voxel_map.note_scale(log.info.scale_known)
     source = f"the map that {mapper.weights_path.name} makes of the frames"
-    stamps = mapper.checkpoint.train_stamps_ns
-    return PseudoLabels(
-        mapper.label_set, lambda f, _: _rendered(mapper, f), source, None, stamps, lambda f: _cast_back(mapper, f)
-    )
+    return PseudoLabels(mapper.label_set, source, mapper=mapper)
 
 
 def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> list[int]:
@@ -440,49 +430,6 @@ def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> li
     return sorted(chosen + _evenly(rest, count - len(chosen)))
 
 
-def match_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> tuple[BoxFile, LabelSet]:
-    """Boxes that can go with pseudo labels, and the label set of a field of them; see ``with_classes``.
-    Raises ConfigError: a class that these lack, with where they come from and what may be done; or no box."""
-    try:
-        boxes, label_set = with_classes(boxes, labels.label_set, path)
-    except ConfigError as error:
-        end = "" if str(error).endswith("?") else "."
-        raise ConfigError(
-            f"{error}{end} Pseudo labels are {labels.source}: correct the classes of the boxes, say in `merge` of the "
-            "file which class of the labels stands for it, or give other labels or weights (--pseudo)"
-        ) from error
-    if not boxes.primitives:
-        raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
-    return boxes, label_set
-
-
-def boxed_field(
-    boxes: BoxFile, frames: Sequence[PosedFrame], label_set: LabelSet, uncovered: str
-) -> tuple[Panoptic, int]:
-    """An empty field with the boxes that frames may see, and how many they cannot.
-    Raises ConfigError: they can see none."""
-    seen = boxes_in_view(boxes.primitives, frames)
-    config = PanopticConfig(
-        boxes=tuple(box_config(p) for p, there in zip(boxes.primitives, seen, strict=True) if there),
-        merge=dict(boxes.merge),
-        uncovered="empty" if uncovered == "empty" else "stuff",
-    )
-    return Panoptic(config, label_set), int((~seen).sum())
-
-
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:
     count = min(count, len(numbers))
     return [numbers[round(i * (len(numbers) - 1) / max(count - 1, 1))] for i in range(count)]
-
-
-def _rendered(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
-    label = mapper.step(replace(frame, label=None, label_is_pseudo=False)).label
-    return replace(frame, label=label, label_is_pseudo=True)
-
-
-def _cast_back(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
-    """A frame with the labels of the map, and its own where the map has none: many views err less than one."""
-    if frame.label is None:
-        return frame
-    seen = mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label
-    return replace(frame, label=np.where(seen == mapper.label_set.ignore_id, frame.label, seen))

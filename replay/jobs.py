@@ -1,6 +1,6 @@
 """What can be done with a log or a map: nothing here prints.
 
-The command line, the nodes and the fleet call these; ``finetune_log`` and ``autolabel_log`` have a module of their own.
+The command line, the nodes and the fleet call these; ``finetune_log`` and ``autolabel_log`` have modules of their own.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -22,7 +22,6 @@ from semantic_mapper.mapping.refine import RefineReport, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.artifacts import clear_results, finish_session
-from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.evaluate.methods import (
@@ -34,7 +33,6 @@ from semantic_mapper.replay.evaluate.methods import (
 )
 from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.exporters.map_files import parse_up
-from semantic_mapper.replay.finetune_log import FinetuneRequest, FinetuneResult, finetune_log
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.run_folder import hold_folder, prepare_file
@@ -43,30 +41,11 @@ from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.scale import fit_to_scene
 from semantic_mapper.types import PosedFrame
 
-__all__ = [
-    "OFFLINE",
-    "AutolabelRequest",
-    "FinetuneRequest",
-    "FinetuneResult",
-    "autolabel_log",
-    "evaluate_log",
-    "finetune_log",
-    "refine_map",
-    "replay_log",
-]
-
 # Of the mapper, where its settings say nothing: nobody waits for the map of a log, so that a frame whose depth is
 # computed waits for later ones.
 OFFLINE = {"depth.from_motion.delay_frames": 6}
 
 _log = get_logger(__name__)
-
-
-class ReplayResult(NamedTuple):
-    """What a replay came to: the summary, as in ``summary.json``, and the session that it is of."""
-
-    summary: dict[str, Any]
-    session: MapSession
 
 
 def replay_log(
@@ -79,10 +58,13 @@ def replay_log(
     rerun: Path | None = None,
     corrections: Path | None = None,
     monitor: JobMonitor | None = None,
-) -> ReplayResult:
-    """Map a log and write summary, map, pictures and report; after a stop request, those of the frames so far.
+) -> tuple[dict[str, Any], MapSession]:
+    """Map a log and write summary, map, pictures and report; after a stop request, those of the frames so far. Returns
+    the summary, and the session that it is of.
 
-    Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped.
+    Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped. Raises
+    LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why. ImportSourceError: the
+    corrections cannot be read.
 
     Args:
         log: The log, a folder with the parts of a recording, or these parts.
@@ -91,9 +73,6 @@ def replay_log(
         rerun: Where to write a Rerun recording.
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
         monitor: Gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
-
-    Raises LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
-    ImportSourceError: the corrections cannot be read.
     """
     monitor = monitor or JobMonitor()
     trajectory = read_corrections(corrections) if corrections else None
@@ -120,7 +99,15 @@ def replay_log(
         monitor.start(total)
         _log.info("mapping", log=source.path.name, frames=total, weights=bundle.weights_path.name)
         try:
-            done = _map_frames(session, source, total, monitor)
+            for number, item in enumerate(source.frames_or_errors(total)):
+                if isinstance(item, PosedFrame):
+                    session.process(item)
+                else:
+                    session.refuse(number, 0, str(item))
+                monitor.set(number + 1)
+                if monitor.stopped_by:
+                    _log.warning("stopped", by=monitor.stopped_by, frames=number + 1, of=total)
+                    break
             if trajectory is not None and not monitor.stopped_by:
                 correct_session(session, trajectory)
         except SemanticMapperError:  # the map is full, for one: what is in it is worth keeping
@@ -128,25 +115,10 @@ def replay_log(
             raise
         summary = finish_session(session, out, monitor.stopped_by)
     if not session.fused:
-        reason = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
-        reason = session.refusals.first[0].reason if session.refusals else reason
-        raise LogError(f"{source.path}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
-    return ReplayResult(summary, session)
-
-
-def _map_frames(session: MapSession, log: Log, total: int, monitor: JobMonitor) -> int:
-    """Feed the session; how many frames were looked at."""
-    done = 0
-    for done, item in enumerate(log.frames_or_errors(total), 1):
-        if isinstance(item, PosedFrame):
-            session.process(item)
-        else:
-            session.refuse(done - 1, 0, str(item))
-        monitor.set(done)
-        if monitor.stopped_by:
-            _log.warning("stopped", by=monitor.stopped_by, frames=done, of=total)
-            break
-    return done
+        empty = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
+        reason = f"the first: {session.refusals.first[0].reason}" if session.refusals else empty
+        raise LogError(f"{source.path}: none of {counted(session.published, 'frame')} could be mapped; {reason}")
+    return summary, session
 
 
 def evaluate_log(
@@ -159,7 +131,7 @@ def evaluate_log(
     instances: Path | None = None,
     monitor: JobMonitor | None = None,
 ) -> Evaluation:
-    """Score a log with several methods.
+    """Score a log with several methods. Raises LogError, LabelError, WeightsError: nothing can be scored.
 
     Computed depth never waits for later frames, since scores are of frames as they come.
 
@@ -169,8 +141,6 @@ def evaluate_log(
         max_frames: 0 = all.
         baseline_s: Also fit the baselines to the keyframes of the weights, the U-Net for so long; 0 = no baselines.
         instances: Folder with images of the frames' true objects; None = things are not scored.
-
-    Raises LogError, LabelError, WeightsError: nothing can be scored.
     """
     monitor, config = monitor or JobMonitor(), config or MapperConfig()
     from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
@@ -243,14 +213,6 @@ def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
     return [log.frame(i) for i in numbers]
 
 
-class RefineResult(NamedTuple):
-    """What refining has changed; the digest of the network, or ``smoothed``; and the name of the map's label set."""
-
-    report: RefineReport
-    weights: str
-    label_set: str
-
-
 def refine_map(
     path: Path,
     out: Path,
@@ -260,17 +222,18 @@ def refine_map(
     up: str = "auto",
     by_name: bool = False,
     monitor: JobMonitor | None = None,
-) -> RefineResult:
-    """Relabel a saved map by its shape, colour and votes, into a new one.
+) -> tuple[RefineReport, str]:
+    """Relabel a saved map by its shape, colour and votes, into a new one; what has changed, and the digest of the
+    network, or ``smoothed``.
+
+    Raises ConfigError: ``up`` is no direction, or the new map cannot be written there. MapError, WeightsError: map and
+    weights cannot be read, or do not go together.
 
     Args:
         weights: Of a network, or ``smoothed``; None = those that ship, or smoothing for a map of other classes.
         fill: Surface without votes gets a class that is at least so likely; 1 = never.
         up: Up in the world: ``auto``, an axis, or three numbers.
         by_name: Whether weights of other classes are matched by the names of these.
-
-    Raises ConfigError: ``up`` is no direction, or the new map cannot be written there. MapError, WeightsError: map and
-    weights cannot be read, or do not go together.
     """
     monitor = monitor or JobMonitor()
     direction = parse_up(up)
@@ -285,4 +248,4 @@ def refine_map(
 
     report = refine(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
     voxel_map.save(out)
-    return RefineResult(report, network.digest, voxel_map.label_set.name)
+    return report, network.digest

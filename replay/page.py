@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,12 +32,7 @@ from semantic_mapper.types import Float64, UInt8
 MAX_VIEW_POINTS = 300_000  # 10 bytes each
 _TEMPLATES = Path(__file__).parent / "templates"
 
-
-class Picture(NamedTuple):
-    """A picture with its source, a ``data:`` URL."""
-
-    source: str
-    caption: str
+Picture = tuple[str, str]  # its source, a ``data:`` URL, and its caption
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +48,8 @@ class Section:
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
-    """Write a page, whole or not at all; sections with nothing but a heading are left out.
-
-    Raises ConfigError: it cannot be written.
-    """
+    """Write a page, whole or not at all; sections with nothing but a heading are left out. Raises ConfigError: it
+    cannot be written."""
     pages = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -65,9 +58,10 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
         lstrip_blocks=True,
         finalize=lambda value: value if isinstance(value, Markup) else _shown(str(value)),
     )
+    pages.globals["zip"] = zip
     pages.filters["lines"] = lambda text: Markup(escape(visible(without_secrets(text), keep="\n")))
     script = (_TEMPLATES / "points.js").read_text(encoding="utf-8")
-    parts = [_plain(s) for s in sections if s.notes or s.view or s.pictures or s.tables or s.folded]
+    parts = [s for s in sections if s.notes or s.view or s.pictures or s.tables or s.folded]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     page = pages.get_template("report.html.jinja").render(
         title=title, sections=parts, script=Markup(script), script_digest=digest
@@ -84,25 +78,10 @@ def _shown(text: str) -> str:
     return text if text.startswith("data:image/") else visible(without_secrets(text))
 
 
-def _plain(section: Section) -> dict[str, Any]:
-    """A section as the template takes it."""
-    tables = [
-        {
-            "title": str(table.title or ""),
-            "heads": [str(column.header) for column in table.columns],
-            "right": [column.justify == "right" for column in table.columns],
-            "rows": [list(map(str, row)) for row in zip(*(c.cells for c in table.columns), strict=True)],
-            "sections": [number for number, row in enumerate(table.rows, 1) if row.end_section],
-        }
-        for table in section.tables
-    ]
-    return {**{name: getattr(section, name) for name in Section.__slots__}, "tables": tables}
-
-
 def picture(pixels: UInt8, caption: str, *, photo: bool = False) -> Picture:
     """(H, W, 3) RGB; ``photo``: as JPEG, which is smaller where there are no sharp lines."""
     data = _base64(encode_picture(pixels, jpeg=photo))
-    return Picture(f"data:image/{'jpeg' if photo else 'png'};base64,{data}", caption)
+    return f"data:image/{'jpeg' if photo else 'png'};base64,{data}", caption
 
 
 def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
@@ -114,14 +93,11 @@ def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
 
 
 def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
-    """The map for the page's 3D view: ``classes`` as a legend, and ``data`` for ``templates/points.js``.
+    """The map for the page's 3D view, N > 0 points of which at most ``MAX_VIEW_POINTS``, drawn at random, are shown:
+    ``classes`` as a legend, and ``data`` for ``templates/points.js``.
 
-    The points are turned upright. Positions are uint16 fractions of their bounds, below a millimetre in a map of 60 m.
-
-    Args:
-        points: The map; at most ``MAX_VIEW_POINTS`` of them are shown, drawn at random. N > 0.
-        label_set: Names and colours of all labels.
-        up: (3,) rough up direction of the world frame; None = unknown.
+    The points are turned upright; ``up`` (3,) is the rough up of the world, None = unknown. Positions are uint16
+    fractions of their bounds, below a millimetre in a map of 60 m.
     """
     count = min(len(points.xyz), MAX_VIEW_POINTS)
     chosen = np.random.default_rng(0).permutation(len(points.xyz))[:count]
@@ -132,13 +108,8 @@ def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> di
     table[list(label_set.ids), :3] = label_set.colors
     ids = dict(zip(label_set.names, label_set.ids, strict=True)) | {"unknown": label_set.ignore_id}
     classes = [
-        {
-            "id": ids[name],
-            "name": name,
-            "color": "rgb({},{},{})".format(*color),
-            "share": f"{100 * (fraction or 0):.1f} %",
-        }
-        for name, color, fraction in class_rows(points.label, label_set)
+        {"id": ids[name], "name": name, "color": "rgb({},{},{})".format(*color), "share": f"{100 * (part or 0):.1f} %"}
+        for name, color, part in class_rows(points.label, label_set)
     ]
     data = {
         "count": count,
@@ -167,22 +138,3 @@ def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def stage_sections(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
-    """Median and 95th percentile of each stage of a step; a column for each summary's."""
-    stages = {name: s.get("stages_ms") or {} for name, s in summaries.items()}
-    rows = [
-        (
-            stage,
-            *(
-                "-" if (ms := times.get(stage, {}).get(p)) is None else f"{ms:.2f}"
-                for times in stages.values()
-                for p in ("p50", "p95")
-            ),
-        )
-        for stage in dict.fromkeys(stage for times in stages.values() for stage in times)
-    ]
-    if rows:
-        heads = [f"{name} {p}, ms" if len(stages) > 1 else f"{p}, ms" for name in stages for p in ("p50", "p95")]
-        yield Section("Times of the stages of a step", tables=[table_of(("stage", *heads), rows)])

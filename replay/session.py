@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,8 +36,7 @@ MOSTLY = 0.5  # of a frame that weights of its scene know; of the frames that th
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
 SNAPSHOTS = 8  # frames kept for the overview picture
 BIN_GROWTH = 1.005  # each bin of a histogram of times is so much longer than the one before
-SHORTEST_MS, LONGEST_MS = 1e-3, 1e7  # times beyond count as these
-_BINS = math.ceil(math.log(LONGEST_MS / SHORTEST_MS) / math.log(BIN_GROWTH))
+SHORTEST_MS = 1e-3  # shorter times count as this
 
 ItemT = TypeVar("ItemT")
 
@@ -52,28 +52,21 @@ class Refusal:
 
 
 class BoundedLog(Generic[ItemT]):
-    """Counts all items, and keeps the first ones, at most ``most``, and the last one (``last``, if there was one)."""
+    """Counts all items, and keeps the first ones, at most ``MAX_LISTED``."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self) -> None:
         self.first: list[ItemT] = []
-        self.last: ItemT | None = None
-        self._most = most
-        self._count = 0
+        self.count = 0
 
     def __len__(self) -> int:
         """How many there were, kept or not."""
-        return self._count
+        return self.count
 
     def append(self, item: ItemT) -> None:
         """Count one more."""
-        self._count += 1
-        self.last = item
-        if len(self.first) < self._most:
+        self.count += 1
+        if len(self.first) < MAX_LISTED:
             self.first.append(item)
-
-    def skip(self, count: int) -> None:
-        """Count this many more, of which nothing is known."""
-        self._count += count
 
 
 class LatencyHistogram:
@@ -81,25 +74,22 @@ class LatencyHistogram:
 
     def __init__(self) -> None:
         self.first: float | None = None  # stands by itself: it may compile kernels, once on a machine
-        self._counts = np.zeros(_BINS, np.int64)
-        self._least, self._most = math.inf, -math.inf
+        self._counts = Counter[int]()  # by the logarithm of the time
 
     def add(self, ms: float) -> None:
         """Count one more step."""
         if self.first is None:
             self.first = ms
-            return
-        at = math.log(max(ms, SHORTEST_MS) / SHORTEST_MS) / math.log(BIN_GROWTH)
-        self._counts[min(int(at), _BINS - 1)] += 1
-        self._least, self._most = min(self._least, ms), max(self._most, ms)
+        else:
+            self._counts[round(math.log(max(ms, SHORTEST_MS), BIN_GROWTH))] += 1
 
     def percentile(self, percent: float) -> float | None:
         """Of all steps but the first; of the first where it is the only one, None without any."""
-        count = int(self._counts.sum())
-        if not count:
+        if not self._counts:
             return self.first
-        at = int(np.searchsorted(np.cumsum(self._counts), round(percent / 100 * (count - 1)), side="right"))
-        return min(max(SHORTEST_MS * BIN_GROWTH ** (at + 0.5), self._least), self._most)
+        bins = sorted(self._counts)
+        count = np.cumsum([self._counts[number] for number in bins])
+        return BIN_GROWTH ** bins[int(np.searchsorted(count, round(percent / 100 * (count[-1] - 1)), side="right"))]
 
 
 class MapSession:
@@ -141,8 +131,8 @@ class MapSession:
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
         # which no frame can be made out:
-        self.refusals, self.label_refusals = BoundedLog[Refusal](MAX_LISTED), BoundedLog[Refusal](MAX_LISTED)
-        self.damages = BoundedLog[str](MAX_LISTED)
+        self.refusals, self.label_refusals = BoundedLog[Refusal](), BoundedLog[Refusal]()
+        self.damages = BoundedLog[str]()
         self.step_ms = LatencyHistogram()
         self.stage_ms: dict[str, LatencyHistogram] = {}
         self.confusion = ConfusionMatrix(self.pipeline.label_set)
@@ -162,24 +152,25 @@ class MapSession:
         Returns what became of each: the update, or why it was refused (counted and logged, the map unchanged)."""
         self.published += 1
         taken = self.odometry_sessions.take(frame)
-        return [*self._give_up(taken), *(done for item in taken.ready for done in self._prepare(item))]
-
-    def _give_up(self, taken: Taken) -> list[MapUpdate | Refusal]:
-        return [self._refuse(frame, PoseError(reason)) for frame, reason in taken.given_up]
-
-    def _prepare(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
-        began = time.perf_counter()
-        try:
-            ready = self.pipeline.prepare(frame)
-        except FrameError as error:
-            return [self._refuse(frame, error)]
-        depth_ms = (time.perf_counter() - began) * 1e3
-        return [self._map(item, depth_ms / len(ready)) for item in ready]
+        done = self._give_up(taken)
+        for item in taken.ready:
+            began = time.perf_counter()
+            try:
+                ready = self.pipeline.prepare(item)
+            except FrameError as error:
+                done.append(self._refuse(item, error))
+                continue
+            depth_ms = (time.perf_counter() - began) * 1e3
+            done += [self._map(prepared, depth_ms / len(ready)) for prepared in ready]
+        return done
 
     def process_rest(self) -> list[MapUpdate | Refusal]:
         """Map the frames that still wait for later ones, which do not come any more."""
         left = self._give_up(self.odometry_sessions.take_rest())
         return [*left, *(self._map(item, 0.0) for item in self.pipeline.prepare_rest())]
+
+    def _give_up(self, taken: Taken) -> list[MapUpdate | Refusal]:
+        return [self._refuse(frame, PoseError(reason)) for frame, reason in taken.given_up]
 
     def _refuse(self, frame: PosedFrame, error: FrameError) -> Refusal:
         self.refusals.append(refusal := Refusal(frame.seq, frame.stamp_ns, str(error), frame.camera_id))
@@ -198,13 +189,26 @@ class MapSession:
         for name, value in update.stage_ms.items():
             self.stage_ms.setdefault(name, LatencyHistogram()).add(value)
         self.fused += int(update.fused)
-        self._note_depth(frame)
+        if frame.depth_m is None:
+            if not self.without_depth:
+                _log.warning("geometry_is_rendered", seq=frame.seq, reason="the frame has no depth")
+            self.without_depth += 1
+        elif frame.depth_sigma_m is not None:
+            if not self.computed_depth:
+                _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
+            self.computed_depth += 1
+            self.too_little_motion += not frame.depth_m.any()
         # How much weights of one scene know of it: weights of another scene cannot be recognised otherwise.
         known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
         self._known.append(known)
         self.outside += known < MOSTLY
         frame = self.pipeline.corrector.place(frame)  # where the map has it
-        self._keep_snapshot(self._score(frame, update), update)
+        scored = self._score(frame, update)
+        if self.fused % self._snapshot_stride == 0:  # a bounded, evenly spread sample of the session
+            self.snapshots.append((scored, update))
+        if len(self.snapshots) > SNAPSHOTS:
+            self.snapshots = self.snapshots[::2]
+            self._snapshot_stride *= 2
         if self.rerun is not None:
             self.rerun.log_step(frame, update)
         return replace(update, world=frame.world, T_map_world=self.odometry_sessions.where(frame.world))
@@ -219,17 +223,6 @@ class MapSession:
         self.corrected_poses = self.pipeline.corrector.status.poses
         self.surface_truth.move(self.pipeline.corrector.poses())
 
-    def _note_depth(self, frame: PosedFrame) -> None:
-        if frame.depth_m is None:
-            if not self.without_depth:
-                _log.warning("geometry_is_rendered", seq=frame.seq, reason="the frame has no depth")
-            self.without_depth += 1
-        elif frame.depth_sigma_m is not None:
-            if not self.computed_depth:
-                _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
-            self.computed_depth += 1
-            self.too_little_motion += not frame.depth_m.any()
-
     def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
         """Count a frame that was damaged before it could be processed."""
         self.published += 1
@@ -240,7 +233,7 @@ class MapSession:
         """Count frames that a player could not read and has not sent; reasons are those of the first few."""
         for reason in reasons[:count]:
             self.refusals.append(Refusal(0, 0, reason))
-        self.refusals.skip(max(0, count - len(reasons)))
+        self.refusals.count += max(0, count - len(reasons))
         self.published += count
         self.unreadable += count
 
@@ -296,22 +289,12 @@ class MapSession:
         self.surface_truth.add(replace(frame, label=truth))
         return frame
 
-    def _keep_snapshot(self, frame: PosedFrame, update: MapUpdate) -> None:
-        """A bounded, evenly spread sample of the session, whatever its length."""
-        if self.fused % self._snapshot_stride == 0:
-            self.snapshots.append((frame, update))
-        if len(self.snapshots) > SNAPSHOTS:
-            self.snapshots = self.snapshots[::2]
-            self._snapshot_stride *= 2
-
 
 def open_recording(path: Path | None, pipeline: MappingPipeline) -> RerunLog | None:
     """A Rerun recording (.rrd) of a session with this pipeline; None where no path is given."""
     if path is None:
         return None
-    from semantic_mapper.replay.exporters.rerun_log import (  # loads for over a second, and few sessions need it
-        RerunLog,
-        recording_file,
-    )
+    # It loads for over a second, and few sessions need it.
+    from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 
     return RerunLog(recording_file(path), pipeline.label_set, pipeline.voxel_map.config.voxel_size_m)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,80 +33,87 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def dig(summary: Mapping[str, Any], path: str) -> Any:
-    """The value at a dotted place of a summary, None where it has no such place."""
+    """The value at a dotted place of a summary, None where it has no such place; the whole for ""."""
     value: Any = summary
-    for key in path.split("."):
+    for key in path.split(".") if path else ():
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
 
 
-def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
-    """One column a summary, by name; classes that any of them has scored come last."""
-    table = Table(title="replay", title_justify="left")
-    table.add_column("")
-    for name in summaries:
+def figures_table(
+    title: str,
+    records: Mapping[str, Mapping[str, Any]],
+    rows: Sequence[tuple[str, str, Callable[[Any], str]]],
+    by_name: Sequence[tuple[str, str, Callable[[Any], str]]],
+) -> Table:
+    """One column a record, by its name. ``rows`` are a head, the dotted place of a value and how it is shown; those of
+    ``by_name`` are a head and the place of values with names of their own, a row each. Rows without a value are left
+    out."""
+    table = Table("", title=title, title_justify="left")
+    for name in records:
         table.add_column(name, justify="right")
-    columns = list(summaries.values())
-    for name, path, show in _ROWS:
-        values = [dig(s, path) if path else s for s in columns]
-        if any(v is not None for v in values):
-            table.add_row(name, *(show(v) if v is not None else "-" for v in values))
-    classes = [dig(s, "metrics.per_class") or {} for s in columns]
-    names = list(dict.fromkeys(n for c in classes for n in c))
-    if names:
+
+    def add(head: str, values: Sequence[Any], show: Callable[[Any], str]) -> None:
+        table.add_row(head, *("-" if value is None else show(value) for value in values))
+
+    for head, path, show in rows:
+        values = [dig(record, path) for record in records.values()]
+        if any(value is not None for value in values):
+            add(head, values, show)
+    for head, path, show in by_name:
+        found = [dig(record, path) or {} for record in records.values()]
         table.add_section()
-    for name in names:
-        table.add_row(f"IoU {name}", *(percent(c[name]) if c.get(name) is not None else "-" for c in classes))
+        for name in dict.fromkeys(name for values in found for name in values):
+            add(f"{head} {name}", [values.get(name) for values in found], show)
     return table
+
+
+def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
+    """One column a summary, by name."""
+    return figures_table("replay", summaries, _ROWS, _ROWS_BY_NAME)
 
 
 def result_lines(out: Path) -> list[str]:
     """Where the results are."""
-    what = {
-        "overview.png": "picture",
-        "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
-        "map.npz": "the map itself",
-        "report.html": "report on one page, for a browser",
-        "summary.json": "all figures",
-    }
-    return [f"  {out / name}  ({text})" for name, text in what.items() if (out / name).exists()]
+    return [f"  {out / name}  ({text})" for name, text in _RESULTS.items() if (out / name).exists()]
 
 
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
-    frames, lines = summary["frames"], []
-    for warning in (dig(summary, "map.nearly_empty"), dig(summary, "pose_check.warning")):
-        lines += [f"warning: {warning}"] if warning else []
-    lines += [f"warning: {note}" for note in dig(summary, "pictures.notes") or ()]
+    frames, warnings = summary["frames"], (dig(summary, "map.nearly_empty"), dig(summary, "pose_check.warning"))
+    lines = [f"warning: {warning}" for warning in (*warnings, *(dig(summary, "pictures.notes") or ())) if warning]
     for path, text in _DEPTH_NOTES.items():
         if fraction := dig(summary, path):
             lines.append(text.format(percent(fraction)))
     unused = frames.get("published", 0) - sum(frames.get(name, 0) for name in ("dropped", "refused", "fused"))
     if unused and dig(summary, "depth.computed_fraction"):
         lines.append(
-            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at "
-            "the beginning of a walk"
+            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure"
         )
     if summary.get("scale") == "unknown":
-        lines.append(
-            f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {SCALE_FIX}"
-        )
+        lines.append(f"scale: unknown; lengths of this map are not metres, what needs metres is refused: {SCALE_FIX}")
     reason = f"refused; the first: {summary['refusals'][0]['reason'] if summary.get('refusals') else ''}"
     for name, text in {**_FRAME_NOTES, "refused": reason}.items():
         if frames.get(name):
             lines.append(f"{counted(frames[name], 'frame')} {text}")
-    if summary.get("damaged_stretches"):
-        damaged = counted(len(summary["damaged_stretches"]), "damaged stretch", "damaged stretches")
-        lines.append(f"{damaged} of the log passed over")
-    if dig(summary, "map.unfinished_correction"):
-        lines.append(summary["map"]["unfinished_correction"])
-    if summary.get("stopped_by"):
-        lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
-    if summary.get("restarted"):
-        lines.append(f"{summary['restarted']}; frames are counted since then")
+    if damaged := summary.get("damaged_stretches"):
+        lines.append(f"{counted(len(damaged), 'damaged stretch', 'damaged stretches')} of the log passed over")
+    if unfinished := dig(summary, "map.unfinished_correction"):
+        lines.append(unfinished)
+    if stopped := summary.get("stopped_by"):
+        lines.append(f"stopped by {stopped}: the results are those of the frames so far")
+    if restarted := summary.get("restarted"):
+        lines.append(f"{restarted}; frames are counted since then")
     return lines
 
 
+_RESULTS = {
+    "overview.png": "picture",
+    "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
+    "map.npz": "the map itself",
+    "report.html": "report on one page, for a browser",
+    "summary.json": "all figures",
+}
 _DEPTH_NOTES = {
     "depth.computed_fraction": "depth: computed from the pictures for {} of the frames, which have no sensor depth; "
     "expect a surface less exact than a sensor's, and holes in plain walls",
@@ -137,6 +144,10 @@ def _voxel_size(summary: Mapping[str, Any]) -> str:
     return "-" if size is None else voxel_size_text(size, summary.get("scale") != "unknown")
 
 
+def _stage(times: Mapping[str, float | None]) -> str:
+    return ", ".join("-" if ms is None else f"{ms:.2f}" for ms in times.values()) + " ms"
+
+
 def _scene_known(scene: Mapping[str, Any]) -> str:
     """Pixels that weights of one scene know; those of another scene know few."""
     known, outside = percent(scene["known"]), scene["frames_outside"]
@@ -151,28 +162,15 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
 
 def describe_depth(depth: Mapping[str, Any]) -> str:
     """Where depth comes from."""
-    if depth["source"] != "mixed":
-        return _DEPTH_SOURCES[depth["source"]]
     fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
     parts = [f"{how} for {percent(depth[key])}" for how, key in fractions.items() if depth.get(key)]
-    return f"{', '.join(parts)} of the frames"
+    return f"{', '.join(parts)} of the frames" if parts else "sensor"
 
 
-_DEPTH_SOURCES = {
-    "sensor": "sensor",
-    "rendered": "rendered by the field (no depth sensor)",
-    "computed": "computed from the pictures (no depth sensor)",
-}
-_ROWS: Sequence[tuple[str, str, Any]] = (
+_ROWS: Sequence[tuple[str, str, Callable[[Any], str]]] = (
     ("log", "source", str),
     ("weights", "weights.file", str),
-    ("frames published", "frames.published", str),
-    ("frames fused", "frames.fused", str),
-    ("frames dropped", "frames.dropped", str),
-    ("frames refused", "frames.refused", str),
-    ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
     ("scale", "scale", str),
-    ("frames scored", "frames.scored", str),
     ("depth", "depth", describe_depth),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
@@ -190,4 +188,9 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("average accuracy", "metrics.average_accuracy", percent),
     ("mIoU a frame", "metrics_per_image.miou", percent),
     ("mIoU of the map", "metrics.map_miou", percent),
+)
+_ROWS_BY_NAME: Sequence[tuple[str, str, Callable[[Any], str]]] = (
+    ("frames", "frames", str),
+    ("stage p50, p95:", "stages_ms", _stage),
+    ("IoU", "metrics.per_class", percent),
 )

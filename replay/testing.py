@@ -168,7 +168,6 @@ class LogReplays:
         key = repr((log, weights, mapper, max_frames))
         if key not in self._done:
             folder = self._make_folder(log.stem)
-            result = replay_log(log, folder, weights, mapper, max_frames)
-            voxel_map = result.session.pipeline.voxel_map
-            self._done[key] = ReplayedMap(folder, voxel_map, result.summary, self._root, self._update)
+            summary, session = replay_log(log, folder, weights, mapper, max_frames)
+            self._done[key] = ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
         return self._done[key]

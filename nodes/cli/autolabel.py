@@ -40,7 +40,8 @@ def autolabel(
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
     """
     must_be_there(*log)
-    from semantic_mapper.replay.jobs import OFFLINE, AutolabelRequest, autolabel_log
+    from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
+    from semantic_mapper.replay.jobs import OFFLINE
 
     prepare_file(out)
     config = load_mapper_config(None, defaults=OFFLINE)

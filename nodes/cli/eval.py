@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from semantic_mapper.config import AtLeastZero
 from semantic_mapper.errors import ConfigError
@@ -76,7 +75,6 @@ def evaluate(
     from semantic_mapper.replay.jobs import evaluate_log
 
     settings = mapper.load()
-    tables: dict[str, Table] = {}
     for log in logs:
         with frame_progress("score", None) as bar:
             baseline_s = seconds if baselines else 0.0
@@ -84,10 +82,9 @@ def evaluate(
                 log, weights, settings, max_frames, baseline_s=baseline_s, instances=instances, monitor=bar
             ).plain()
         found["logs"][str(log)] = scores
-        tables[str(log)] = score_table(log.name, scores)
-        output.print(tables[str(log)])
+        output.print(score_table(log.name, scores))
     write_json(path, found)
-    write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
+    write_eval_report(page := path.with_suffix(".html"), found, folders)
     output.print(f"written to {path} and, for a browser, {page}")
     output.json(found)
 

@@ -70,7 +70,8 @@ def finetune(
     settings = training.convert(FinetuneConfig)
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
-    from semantic_mapper.replay.jobs import OFFLINE, FinetuneRequest, finetune_log
+    from semantic_mapper.replay.finetune_log import FinetuneRequest, finetune_log
+    from semantic_mapper.replay.jobs import OFFLINE
 
     keep_freed_memory()
     request = FinetuneRequest(
@@ -89,12 +90,12 @@ def finetune(
         strokes=strokes,
     )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%", stop=stop) as bar:
-        result = finetune_log(request, bar)
-    if result.chosen:
-        output.print(f"{out}: finetuned on frames {', '.join(map(str, result.chosen))} of {log.name}")
-    for line in _recipe_lines(result.checkpoint.recipe, len(result.chosen)):
+        checkpoint, chosen = finetune_log(request, bar)
+    if chosen:
+        output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
+    for line in _recipe_lines(checkpoint.recipe, len(chosen)):
         output.print(f"  {line}")
-    if result.checkpoint.model.holds_scene:
+    if checkpoint.model.holds_scene:
         size = f"{out.stat().st_size / 1e6:.1f} MB"
         output.print(f"{out}: {size} that show the scene of {log.name}: as private as the recording")
     if stop:

@@ -116,6 +116,5 @@ def choose_keyframes(
         label_set = log.info.label_set if folder is None else folder.label_set
         if label_set is None:
             raise LabelError(f"{path}: has no label images; give --images with a folder that has labels.json")
-        request = FinetuneRequest(path, path, keyframes=count, frames=() if folder is None else folder.numbers())
-        source = FrameSource(log, folder, request, {})
-        return source.choose_labelled(label_set, monitor) if folder is None else source.named(), label_set
+        request = FinetuneRequest(path, path, keyframes=count if folder is None else 0)
+        return FrameSource(log, folder, request, monitor, {}).choose_labelled(label_set, least=1), label_set

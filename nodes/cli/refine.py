@@ -45,8 +45,7 @@ def refine(
     from semantic_mapper.replay.jobs import refine_map
 
     with frame_progress("refine", None, unit="tiles") as bar:
-        result = refine_map(path, out, weights, fill=fill, up=up, by_name=by_name, monitor=bar)
-    report = result.report
+        report, digest = refine_map(path, out, weights, fill=fill, up=up, by_name=by_name, monitor=bar)
 
     def percent(count: int) -> str:
         return f"{100 * count / max(report.surface, 1):.1f} %"
@@ -57,9 +56,9 @@ def refine(
         if before or report.after[name]
     ]
     output.print(table(rows, ("", "before", "after"), title="fraction of the surface", numbers=("before", "after")))
-    if result.weights == SMOOTHED:
+    if digest == SMOOTHED:
         output.print("the votes were smoothed, nothing was learned")
     else:
         output.print(f"refined by the weights {weights or SHIPPED}")
     output.print(f"{out}: {percent(report.relabelled)} of the surface relabelled, {percent(report.filled)} filled")
-    output.json(asdict(report) | {"weights": result.weights, "out": str(out)})
+    output.json(asdict(report) | {"weights": digest, "out": str(out)})

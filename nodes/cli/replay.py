@@ -78,9 +78,9 @@ def replay(
         raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
     with StopRequest() as stop:
         with frame_progress("replay", None, stop=stop) as bar:
-            summary = replay_log(
+            summary, _ = replay_log(
                 source, out, weights, config, max_frames, rerun=rerun, corrections=corrections, monitor=bar
-            ).summary
+            )
         show_replay(output, summary, out)
         output.json(summary)
         if stop:
@@ -110,7 +110,7 @@ def demo(
     prepare_folder(out)
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:
-            summary = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar).summary
+            summary, _ = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar)
         show_replay(output, summary, out)
         output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"

@@ -59,17 +59,10 @@ from semantic_mapper.nodes.fleet.store import (
     reaching,
 )
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
-from semantic_mapper.replay.jobs import (
-    OFFLINE,
-    AutolabelRequest,
-    FinetuneRequest,
-    autolabel_log,
-    evaluate_log,
-    finetune_log,
-    refine_map,
-    replay_log,
-)
+from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
+from semantic_mapper.replay.evaluate.report import write_eval_report
+from semantic_mapper.replay.finetune_log import FinetuneRequest, finetune_log
+from semantic_mapper.replay.jobs import OFFLINE, evaluate_log, refine_map, replay_log
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME
 from semantic_mapper.replay.summary import dig, notes
 from semantic_mapper.training.config import FinetuneConfig
@@ -427,8 +420,7 @@ class Operation:
 
 
 def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
-    result = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
-    summary = result.summary
+    summary, session = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
     metrics |= {name: summary["map"][name] for name in ("surface_points", "blocks", "cleared_voxels", "unknown")}
@@ -440,7 +432,7 @@ def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -
     return Findings(
         metrics=metrics,
         costs={**costs, "map_memory_mb": summary["map"]["memory_mb"]},
-        scores=(_scores("replay", dig(summary, "metrics.per_class") or {}, result.session.segments),),
+        scores=(_scores("replay", dig(summary, "metrics.per_class") or {}, session.segments),),
         events=tuple(events[:_MAX_EVENTS]),
     )
 
@@ -450,7 +442,7 @@ def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> 
     scores = result.plain()
     found: dict[str, Any] = {"replays": {}, "logs": {log.name: scores}}
     write_json(out / "eval.json", found)
-    write_eval_report(out / "eval.html", {}, [], {log.name: score_table(log.name, scores)}, found)
+    write_eval_report(out / "eval.html", found)
     methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
     main = next(iter(methods.values()))
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
@@ -493,18 +485,18 @@ def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSett
         depth=DepthConfig(source="sensor"),
         kind=settings.kind or None,
     )
-    result = finetune_log(request)
-    recipe = result.checkpoint.recipe
+    checkpoint, chosen = finetune_log(request)
+    recipe = checkpoint.recipe
     names = ("steps", "best_step", "held_out_loss", "held_out_accuracy", "psnr")
     return Findings(
         metrics={name: recipe[name] for name in names if name in recipe},
         costs={"fit_s": recipe.get("seconds")},
-        events=(("keyframes", ", ".join(map(str, result.chosen))),),
+        events=(("keyframes", ", ".join(map(str, chosen))),),
     )
 
 
 def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:
-    report = refine_map(log, out / MAP_NAME, weights, **to_plain(settings)).report
+    report, _ = refine_map(log, out / MAP_NAME, weights, **to_plain(settings))
     return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled")})
 
 

@@ -9,39 +9,25 @@ from typing import Any
 
 from rich.table import Table
 
-from semantic_mapper.replay.page import Section, picture_files, stage_sections, table_of, write_page
-from semantic_mapper.replay.summary import notes, percent, summary_table
+from semantic_mapper.replay.page import Section, picture_files, table_of, write_page
+from semantic_mapper.replay.summary import figures_table, notes, percent, summary_table
 
 
-def write_eval_report(
-    path: Path,
-    summaries: Mapping[str, Mapping[str, Any]],
-    folders: Sequence[Path],
-    logs: Mapping[str, Table],
-    found: Any,
-) -> None:
-    """Write the report of ``eval``.
+def write_eval_report(path: Path, found: Mapping[str, Any], folders: Sequence[Path] = ()) -> None:
+    """Write the report of ``eval`` with all figures, as in the JSON file. ConfigError where it cannot be written.
 
-    ``folders`` are those of the ``summaries`` of replays, in order; ``logs`` has the table of each log that was scored,
-    ``found`` all figures, as in the JSON file. ConfigError where it cannot be written.
+    ``folders`` are those of the replays, in order.
     """
-    sections: list[Section] = []
-    if summaries:
-        sections += [Section(tables=[summary_table(summaries)]), *stage_sections(summaries)]
+    summaries, logs = found["replays"], found["logs"]
+    sections = [Section(tables=[summary_table(summaries)])] if summaries else []
     for (name, summary), folder in zip(summaries.items(), folders, strict=True):
         pictures = list(picture_files((folder / "overview.png", f"{name}: frames and map")))
         settings = {"Settings that were in force": json.dumps(summary.get("config"), indent=1)}
         sections.append(Section(name, notes(summary), pictures=pictures, folded=settings))
-    for log, table in logs.items():
-        sections.append(Section(Path(log).name, tables=[table]))
+    sections += [Section(Path(log).name, tables=[score_table(Path(log).name, of)]) for log, of in logs.items()]
     if found.get("surface"):
         rows = [
-            (
-                name,
-                f"{f['median_m'] * 1000:.1f} mm",
-                f"{f['complete'] * 100:.1f} %",
-                f"{f['complete_10cm'] * 100:.1f} %",
-            )
+            (name, f"{f['median_m'] * 1000:.1f} mm", percent(f["complete"]), percent(f["complete_10cm"]))
             for name, f in found["surface"].items()
         ]
         heads = ("map", "median distance from the mesh", "of the mesh within 5 cm", "within 10 cm")
@@ -52,41 +38,29 @@ def write_eval_report(
 
 def score_table(title: str, scores: Mapping[str, Any]) -> Table:
     """One column a method."""
-    methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
     counts = f"{scores['scored']} frames scored, {scores['excluded']} left out as keyframes"
     if scores["pseudo_labelled"]:
         counts += f", {scores['pseudo_labelled']} with pseudo labels"
-    table = Table(title=f"{title}: {counts}", title_justify="left")
-    table.add_column("")
-    for name in methods:
-        table.add_column(name, justify="right")
-    for key, text in (
-        ("miou", "mIoU"),
-        ("total_accuracy", "total accuracy"),
-        ("average_accuracy", "average accuracy"),
-        ("coverage", "coverage"),
-        ("ece", "calibration error"),
-        ("sure", "confidence above 0.9"),
-        ("sure_right", "of these right"),
-        ("pq", "PQ"),
-        ("sq", "SQ"),
-        ("rq", "RQ"),
-        ("pq_plus", "PQ+"),
-        ("pq_things", "PQ of things"),
-        ("open_set_auroc", "AUROC, classes it lacks"),
-        ("open_set_unknown", "unknown, of classes it lacks"),
-    ):
-        if any(m.get(key) is not None for m in methods.values()):
-            table.add_row(text, *(_show(m.get(key)) for m in methods.values()))
-    table.add_section()
-    for name in dict.fromkeys(n for m in methods.values() for n in m["per_class"]):
-        table.add_row(f"IoU {name}", *(_show(m["per_class"].get(name)) for m in methods.values()))
-    table.add_section()
-    of_things = [m.get("pq_per_class", {}) for m in methods.values()]
-    for name in dict.fromkeys(n for classes in of_things for n in classes):
-        table.add_row(f"PQ {name}", *(_show(c[name]["pq"] if name in c else None) for c in of_things))
-    return table
+    return figures_table(f"{title}: {counts}", scores["methods"], _ROWS, _ROWS_BY_NAME)
 
 
-def _show(value: float | None) -> str:
-    return "-" if value is None else percent(value)
+_ROWS = [
+    (text, key, percent)
+    for key, text in {
+        "miou": "mIoU",
+        "total_accuracy": "total accuracy",
+        "average_accuracy": "average accuracy",
+        "coverage": "coverage",
+        "ece": "calibration error",
+        "sure": "confidence above 0.9",
+        "sure_right": "of these right",
+        "pq": "PQ",
+        "sq": "SQ",
+        "rq": "RQ",
+        "pq_plus": "PQ+",
+        "pq_things": "PQ of things",
+        "open_set_auroc": "AUROC, classes it lacks",
+        "open_set_unknown": "unknown, of classes it lacks",
+    }.items()
+]
+_ROWS_BY_NAME = (("IoU", "per_class", percent), ("PQ", "pq_per_class", lambda quality: percent(quality["pq"])))

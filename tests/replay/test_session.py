@@ -20,7 +20,7 @@ from semantic_mapper.replay import artifacts
 from semantic_mapper.replay.artifacts import finish_session
 from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.session import LONGEST_MS, SHORTEST_MS, LatencyHistogram, MapSession, open_recording
+from semantic_mapper.replay.session import SHORTEST_MS, LatencyHistogram, MapSession, open_recording
 from semantic_mapper.replay.summary import notes, summary_table
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.small import tiny_config, tiny_field, tiny_frames
@@ -85,7 +85,7 @@ def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
     [
         ("auto", 6, "sensor", "sensor"),
         ("sensor", 3, "mixed", "rendered by the field for 50.0 % of the frames"),
-        ("auto", 0, "computed", "computed from the pictures (no depth sensor)"),
+        ("auto", 0, "computed", "computed from the pictures for 100.0 % of the frames"),
     ],
 )
 def test_summary_table_notes_and_picture_say_where_depth_comes_from(
@@ -213,7 +213,6 @@ def test_a_session_of_days_keeps_count_in_memory_that_does_not_grow(tmp_path, we
     assert abs(grown) < 2000
     summary = finish_session(session, tmp_path / "out")
     assert summary["frames"]["refused"] == 2000 and summary["frames"]["published"] == 2006
-    assert session.refusals.last.seq == 1505
     assert [r["seq"] for r in summary["refusals"]] == [6 + n // 2 for n in range(50)]
     assert summary["damaged_stretches"] == [f"at {n}" for n in range(50)]
     assert summary["latency_ms"]["p95"] == pytest.approx(1459, rel=0.005)
@@ -324,7 +323,7 @@ def test_the_map_is_scored_at_its_points_beside_the_frames():
     assert MAP not in evaluate_frames(frames, {"fused": fuse}, stream, ROOMS, frozenset()).methods
 
 
-@given(st.lists(st.floats(SHORTEST_MS, LONGEST_MS), max_size=60), st.sampled_from([0.0, 50.0, 95.0, 100.0]))
+@given(st.lists(st.floats(SHORTEST_MS, 1e7), max_size=60), st.sampled_from([0.0, 50.0, 95.0, 100.0]))
 def test_percentiles_are_those_of_all_steps_but_the_first(values, percent):
     times = LatencyHistogram()
     for value in values:
