@@ -109,13 +109,12 @@ def check_views(views: SourceViews) -> None:
     Raises ShapeError: naming the tensor, with expected and actual shape."""
     sizes = expect_shape(views.rgb, "M 3 H W", "source rgb")
     count, height, width = sizes["M"], sizes["H"], sizes["W"]
-    expect_shape(views.depth_m, f"{count} {height} {width}", "source depth_m")
     expect_shape(views.K, f"{count} 3 3", "source K")
     expect_shape(views.T_world_camera, f"{count} 4 4", "source T_world_camera")
-    if views.channel is not None:
-        expect_shape(views.channel, f"{count} {height} {width}", "source channel")
-    if views.depth_sigma_m is not None:
-        expect_shape(views.depth_sigma_m, f"{count} {height} {width}", "source depth_sigma_m")
+    for name in ("depth_m", "channel", "depth_sigma_m"):
+        image = getattr(views, name)
+        if image is not None:
+            expect_shape(image, f"{count} {height} {width}", f"source {name}")
 
 
 def sure_depth(views: SourceViews, *, computed: bool) -> SourceViews:
@@ -123,8 +122,7 @@ def sure_depth(views: SourceViews, *, computed: bool) -> SourceViews:
     ``computed``: whether the field has learned from computed depth; without, all of it becomes a hole."""
     if views.depth_sigma_m is None:
         return views
-    worst = UNSURE_SPREAD * views.depth_m if computed else torch.zeros_like(views.depth_m)
-    sure = views.depth_sigma_m <= worst
+    sure = views.depth_sigma_m <= (UNSURE_SPREAD if computed else 0) * views.depth_m
     return replace(views, depth_m=views.depth_m * sure, depth_sigma_m=views.depth_sigma_m * sure)
 
 
@@ -212,33 +210,28 @@ def gather(sources: EncodedViews, where: Reprojection) -> Gathered:
     grid = ((where.uv + 0.5) * (2 / size) - 1).clamp(-2, 2).view(views, rays, samples, 2)
     smooth = torch.cat((sources.feature, sources.rgb), dim=1)
     picked = functional.grid_sample(smooth, grid, padding_mode="border", align_corners=False)
-    column = where.uv[..., 0].detach().round().clamp(0, width - 1).long()
-    row = where.uv[..., 1].detach().round().clamp(0, height - 1).long()
+    uv = where.uv.detach()
     flat = sources.geometry.flatten(2)  # (m, G, h w)
-    index = (row * width + column).view(views, 1, -1).expand(-1, flat.shape[1], -1)
+    index = _nearest(uv, height, width).view(views, 1, -1).expand(-1, flat.shape[1], -1)
     geometry = flat.gather(2, index).view(views, -1, rays, samples)
-    channel = _nearest_channel(sources.channel, where.uv.detach(), height, width)
+    rows, columns = sources.channel.shape[1:]
+    at_label = (uv + 0.5) * uv.new_tensor((columns / width, rows / height)) - 0.5
+    index = _nearest(at_label, rows, columns).flatten(1)
+    channel = sources.channel.flatten(1).gather(1, index).view(where.z.shape).long()
     channels = sources.feature.shape[1]
     picked = picked.permute(0, 2, 3, 1)  # (m, R, N, C + 3)
     return Gathered(picked[..., :channels], picked[..., channels:], geometry.permute(0, 2, 3, 1), channel)
 
 
-def _nearest_channel(channel: torch.Tensor, uv: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """Labels (m, H, W) at pixels uv (m, R, N, 2) of feature maps of (height, width): (m, R, N) int64."""
-    rows, columns = channel.shape[1:]
-    column = ((uv[..., 0] + 0.5) * (columns / width) - 0.5).round().clamp(0, columns - 1).long()
-    row = ((uv[..., 1] + 0.5) * (rows / height) - 0.5).round().clamp(0, rows - 1).long()
-    index = (row * columns + column).flatten(1)
-    return channel.flatten(1).gather(1, index).view(uv.shape[:-1]).long()
+def _nearest(uv: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Row-major index (...) int64 of the pixels nearest to uv (..., 2)."""
+    column, row = (uv[..., i].round().clamp(0, size - 1).long() for i, size in enumerate((width, height)))
+    return row * width + column
 
 
 def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
-    """The source view that each ray was taken from, if any.
-
-    A ray starts at the centre of its camera, and its direction has depth 1 in its camera, so a view that turned on the
-    spot is distinguished too. Returns index (R,) int64 of the best view, same (R,) bool: whether that view's camera is
-    the ray's.
-    """
+    """The source view that each ray was taken from: index (R,) int64 of the best, and (R,) whether its camera is the
+    ray's. A ray starts at the centre of its camera, and its direction has depth 1 there: no view turned on the spot."""
     R_camera_world, t_camera_world = sources.T_camera_world[:, :3, :3], sources.T_camera_world[:, :3, 3]
     start = torch.einsum("mij,rj->mri", R_camera_world, rays.origin) + t_camera_world[:, None]  # (m, R, 3)
     unit_depth = torch.einsum("mj,rj->mr", R_camera_world[:, 2], rays.direction)

@@ -57,11 +57,7 @@ def bfloat16_is_fast(device: torch.device) -> bool:
 
 
 def compute_in_bfloat16(model: nn.Module, names: Sequence[str], device_type: str) -> None:
-    """Let the named parts of ``model`` compute in bfloat16 under autocast and hand back float32.
-
-    Only named parts: reprojection in bfloat16, whose mantissa has 8 bits, would miss its pixel by several pixels.
-    Weights stay float32, as do names in the state dict.
-    """
+    """Let the named parts of ``model`` compute in bfloat16 under autocast and hand back float32."""
     parts = dict(model.named_modules())
     for name in names:
         part: Any = parts[name]
@@ -99,9 +95,8 @@ def _to_float32(result: Any) -> Any:
 class DeviceField:
     """Inference-only field on a device. Satisfies ``SemanticField`` and ``Sampled``.
 
-    Weights and the features of keyframes stay on the device; rays are made there, and callers fetch what is rendered,
-    a chunk at a time. Sums on a GPU come in no fixed order: its renders repeat but for the last digits. The model is
-    copied; with ``bfloat16`` its networks among ``BFLOAT16_PARTS`` compute in that.
+    Weights, features of keyframes and rays stay on the device. Sums on a GPU come in no fixed order: its renders repeat
+    but for the last digits. The model is copied; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
     """
 
     def __init__(

@@ -1,11 +1,8 @@
 """The shared image encoder: light residual U-Nets that give the F_j of S-Ray Eq. 5.
 
-Where it sees depth, it sees the geocentric encoding of Gupta et al. ("Learning Rich Features from RGB-D Images", ECCV
-2014): inverse depth, height above the lowest point in view, and the angle of the surface to gravity. Gravity is found
-in each image by itself, so neither the world's axes nor the mounting of the camera have to be known.
-
-Its backbone may be EfficientNet-Lite0 (M. Tan and Q. Le, ICML 2019; inverted residuals without squeeze and excitation,
-and ReLU6), a network that has seen photographs before it sees rooms.
+Where it sees depth, it sees the geocentric encoding of Gupta et al. (ECCV 2014): inverse depth, height above the lowest
+point in view, and the angle of the surface to gravity, which is found in each image by itself. Its backbone may be
+EfficientNet-Lite0 (Tan and Le, ICML 2019), a network that has seen photographs before it sees rooms.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ import math
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import nn
@@ -60,7 +57,7 @@ GRAVITY_STEPS_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0, 15.0)  # from level or 
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with batch norm and a shortcut: (B, c_in, H, W) -> (B, c_out, H / stride, W / stride)."""
+    """Two 3x3 convolutions with batch norm and a shortcut."""
 
     def __init__(self, c_in: int, c_out: int, stride: int) -> None:
         super().__init__()
@@ -165,11 +162,10 @@ class EfficientNetLite0(nn.Module):
 
 
 class UNet(nn.Module):
-    """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2); H and W need not be multiples of the deepest stride.
+    """A residual U-Net, or one whose deeper stages are EfficientNet-Lite0, which sees colours alone.
 
-    A residual U-Net, or with a backbone EfficientNet-Lite0 in the place of its deeper stages. The backbone sees colours
-    alone. Next to it a slim residual encoder sees all inputs, depth among them: where colours are not those of the
-    training rooms, in photographs, depth is what a view can be known by. The coarsest stage is the backbone's alone.
+    Next to that backbone a slim residual encoder sees all inputs: where colours are not those of the training rooms,
+    depth is what a view can be known by. The coarsest stage is the backbone's alone.
     """
 
     def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
@@ -178,7 +174,13 @@ class UNet(nn.Module):
         self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
         widths = (channels[0], *channels)
         stages = range(len(channels) - pretrained)
-        self.stages = nn.ModuleList(_stage(widths[i], channels[i], max(blocks[i], 1), halves=i > 0) for i in stages)
+        self.stages = nn.ModuleList(
+            nn.Sequential(
+                ResidualBlock(widths[i], channels[i], 2 if i > 0 else 1),
+                *(ResidualBlock(channels[i], channels[i], 1) for _ in range(blocks[i] - 1)),
+            )
+            for i in stages
+        )
         self.backbone = self.laterals = None
         if pretrained:
             self.backbone = EfficientNetLite0(len(channels))
@@ -210,19 +212,12 @@ class UNet(nn.Module):
         return self.head(x)
 
 
-def _stage(c_in: int, c_out: int, blocks: int, *, halves: bool) -> nn.Sequential:
-    first = ResidualBlock(c_in, c_out, 2 if halves else 1)
-    return nn.Sequential(first, *(ResidualBlock(c_out, c_out, 1) for _ in range(blocks - 1)))
-
-
 class ImageEncoder(nn.Module):
     """U-Nets shared by all views; each view is encoded by itself, into C = ``feature_dim`` channels.
 
     Where the config asks for depth there are two: one for views with measured depth, which sees what ``surface_maps``
     makes of it next to the colours, and one for views without. A single network for both would do either less well.
-
-    Batch norm, because on a CPU it costs half of what group norm does and learns faster. Its statistics come from the
-    images only inside ``batch_statistics`` (where the encoder is trained on many different images at once); everywhere
+    Statistics of batch norm come from the images only inside ``batch_statistics`` (training on many images at once);
     else, in training mode too, they are constants, so that a view's features do not depend on the views next to it.
     Raises ConfigError: a shape that cannot be built.
     """
@@ -270,16 +265,16 @@ class ImageEncoder(nn.Module):
 
     @property
     def uncalibrated(self) -> bool:
-        """Whether its norms have never seen an image: constants of a fresh network mean nothing.
-
-        Norms of a pretrained backbone that was frozen from the start have counted no batch, but have statistics.
-        """
-        return any(_is_fresh(norm) for norm in self._norms())
+        """Whether some norm is as it was built: it has counted no batch, and was given no statistics."""
+        return any(
+            not int(n.num_batches_tracked) and not bool(n.running_mean.any()) and bool((n.running_var == 1).all())
+            for n in self.norms()
+        )
 
     def train(self, mode: bool = True) -> Self:
         """Training mode for all but the norms, whose statistics only change inside ``batch_statistics``."""
         super().train(mode)
-        for norm in self._norms():
+        for norm in self.norms():
             norm.train(mode and self._of_batch)
         for part in self._frozen:
             part.eval()
@@ -309,15 +304,9 @@ class ImageEncoder(nn.Module):
         """Those of its networks that may start from ImageNet weights."""
         return (module for module in self.modules() if isinstance(module, EfficientNetLite0))
 
-    def _norms(self) -> Iterator[nn.BatchNorm2d]:
+    def norms(self) -> Iterator[Any]:
+        """Its ``BatchNorm2d``."""
         return (module for module in self.modules() if isinstance(module, nn.BatchNorm2d))
-
-
-def _is_fresh(norm: nn.BatchNorm2d) -> bool:
-    """Whether a norm is as it was built: it has counted no batch, and was given no statistics."""
-    assert norm.running_mean is not None and norm.running_var is not None  # all norms here track their statistics
-    counted = int(norm.num_batches_tracked or 0)
-    return counted == 0 and not bool(norm.running_mean.any()) and bool((norm.running_var == 1).all())
 
 
 def has_depth(depth_m: torch.Tensor) -> torch.Tensor:
@@ -328,7 +317,7 @@ def has_depth(depth_m: torch.Tensor) -> torch.Tensor:
 def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
     """Set the norms of a fresh encoder to the statistics of these views, with their depth and without; no weight
     changes. Where no view has depth, the network that would see it is shown a flat wall."""
-    norms = [module for module in encoder.modules() if isinstance(module, nn.BatchNorm2d)]
+    norms = list(encoder.norms())
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.momentum = 1.0
@@ -342,17 +331,18 @@ def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
 
 
 def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """Maps of the surface (m, 5, H, W) at each pixel; all 0 where depth is not measured.
-
-    Channels: inverse depth (1 / m), 1 where depth is measured, height above the lowest point in view (m), cosine of
-    the normal with up, cosine of the normal with the viewing axis (0 next to holes, where there is no normal).
-    """
+    """Maps of the surface (m, 5, H, W) at each pixel: inverse depth (1 / m), 1 where depth is measured, height above
+    the lowest point in view (m), cosines of the normal with up and with the viewing axis (0 next to holes, where there
+    is no normal). All 0 where depth is not measured."""
     # Not in bfloat16, whose mantissa of 8 bits would make steps of centimetres.
     with torch.no_grad(), torch.autocast(depth_m.device.type, enabled=False):
         if not bool((depth_m > 0).any()):  # also spares a field without depth the work
             return depth_m.new_zeros(len(depth_m), SURFACE_CHANNELS, *depth_m.shape[1:])
         measured = depth_m > 0
-        points = _camera_points(depth_m, K)
+        v, u = (torch.arange(n, dtype=depth_m.dtype, device=depth_m.device) for n in depth_m.shape[1:])
+        x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
+        y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
+        points = torch.stack((x * depth_m, y * depth_m, depth_m), dim=1)  # in the camera's axes
         reach = max(1, round(NORMAL_REACH * depth_m.shape[-1] / REFERENCE_WIDTH))
         normal, known = surface_normals(points, measured, reach)
         stride = max(1, depth_m.shape[-1] // GRAVITY_COLUMNS)
@@ -370,10 +360,8 @@ def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
 
 
 def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normals towards the camera (m, 3, H, W), and where there is one (m, H, W).
-
-    They are central differences of points (m, 3, H, W), each between pixels ``reach`` away on either side.
-    """
+    """Normals towards the camera (m, 3, H, W), and where there is one (m, H, W): central differences of points
+    (m, 3, H, W), each between pixels ``reach`` away on either side."""
     r = reach
     height, width = measured.shape[-2:]
     normal = torch.zeros_like(points)
@@ -394,11 +382,10 @@ def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) ->
 
 
 def up_direction(normal: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """Up (m, 3) in camera axes: what most surfaces are level or plumb to.
+    """Up (m, 3) in camera axes: what most surfaces are level or plumb to (Gupta et al., CVPR 2013, section 3).
 
-    Gupta et al., "Perceptual Organization and Recognition of Indoor Scenes" (CVPR 2013), section 3: starting from the
-    camera's own up, take the normals near to and near to square with it, and turn up to fit them; then the same with
-    closer bounds. The camera may be inclined by up to 45 degrees. ``normal`` (m, 3, h, w), ``known`` (m, h, w) bool.
+    Starting from the camera's own up, take the normals near to and near to square with it, and turn up to fit them;
+    then the same with closer bounds. ``normal`` (m, 3, h, w), ``known`` (m, h, w) bool.
     """
     n = normal.flatten(2)  # (m, 3, P)
     weight = known.flatten(1).to(n.dtype)
@@ -415,16 +402,6 @@ def up_direction(normal: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
         axis = torch.linalg.eigh(spread.double())[1][:, :, 0].to(n.dtype)
         up = torch.where((axis * up).sum(1, keepdim=True) < 0, -axis, axis)
     return up
-
-
-def _camera_points(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """(m, 3, H, W) camera coordinates of the pixels; 0 where depth is not measured."""
-    height, width = depth_m.shape[-2:]
-    u = torch.arange(width, dtype=depth_m.dtype, device=depth_m.device)
-    v = torch.arange(height, dtype=depth_m.dtype, device=depth_m.device)
-    x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
-    y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
-    return torch.stack((x * depth_m, y * depth_m, depth_m), dim=1)
 
 
 def _lowest(height: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:

@@ -36,11 +36,7 @@ class LearnedField(nn.Module, ABC):
 
     A kind of field implements ``encode`` and ``render_samples``; sampling is shared, so that kinds differ in what they
     make of the samples and in nothing else. Kinds that find samples of their own implement ``render`` instead.
-
-    Args:
-        config: Shape of the network; part of every checkpoint.
-        label_set: Classes of the logits.
-        sampling: Where rays are sampled; may be exchanged at any time, no weights depend on it.
+    ``config`` is part of every checkpoint; ``sampling`` may be exchanged at any time, no weights depend on it.
     """
 
     kind: ClassVar[str]
@@ -82,8 +78,8 @@ class LearnedField(nn.Module, ABC):
         return None
 
     def weigh_own_view(self, factor: float, without_depth: float) -> bool:
-        """Let the query's own image count ``factor`` times as much among the views, and ``without_depth`` times on rays
-        without measured depth; False = no choice."""
+        """Let the query's own image count ``factor`` times among the views, ``without_depth`` times on rays without
+        measured depth; False = no choice."""
         return False
 
     def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
