@@ -12,15 +12,6 @@ from semantic_mapper.fields.sray import (
 )
 
 
-def test_a_row_without_any_valid_key_gives_zero_and_finite_gradients():
-    layer = MultiHeadAttention(8, 2)
-    x = torch.randn(2, 3, 8, requires_grad=True)
-    out = layer(x, torch.zeros(2, 3, dtype=torch.bool))
-    assert out.abs().max() == 0
-    out.sum().backward()
-    assert torch.isfinite(x.grad).all()
-
-
 @pytest.mark.parametrize(
     ("attention", "reached"), [(radial_attention, (0, 1)), (cross_view_attention, (0, slice(None), 4))]
 )
@@ -50,8 +41,8 @@ def test_attention_and_view_weights_pass_gradcheck():
     torch.manual_seed(0)
     layer = MultiHeadAttention(4, 2).double()
     x = torch.randn(2, 3, 4, dtype=torch.float64, requires_grad=True)
-    valid = torch.tensor([[True, False, True], [True, True, True]])
-    assert torch.autograd.gradcheck(lambda t: layer(t, valid), (x,))
+    valid = torch.tensor([[True, False, True], [False] * 3])  # a row without any valid key gives zeros
+    assert torch.autograd.gradcheck(lambda t: layer(t, valid), (x,)) and not layer(x, valid)[1].any()
     score = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
     seen = torch.tensor([[True] * 4, [True, False, True, True], [True, True, False, False]])
     assert torch.autograd.gradcheck(lambda s: constrained_weights(s, seen, 0.1), (score,))

@@ -12,7 +12,6 @@ import torch
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.encoder import (
-    EfficientNetLite0,
     ImageEncoder,
     calibrate,
     surface_maps,
@@ -41,16 +40,6 @@ def encoder(config: EncoderConfig = SMALL_ENCODER) -> ImageEncoder:
     return ImageEncoder(config, 16)
 
 
-def test_a_views_features_do_not_depend_on_the_views_beside_it_in_training_mode_either():
-    field = encoder()
-    calibrate(field, views(4))
-    for mode in (True, False):
-        field.train(mode)
-        together = field(views(4))
-        alone = field(SourceViews(*(getattr(views(4), n)[1:2] for n in ("rgb", "depth_m", "K", "T_world_camera"))))
-        torch.testing.assert_close(together[1:2], alone, atol=1e-5, rtol=1e-4)
-
-
 def test_statistics_change_inside_batch_statistics_and_nowhere_else():
     field = encoder()  # as built: in training mode
     before = {name: t.clone() for name, t in field.named_buffers()}
@@ -71,14 +60,12 @@ def test_calibration_makes_a_fresh_encoder_normalise_and_changes_no_weight():
     assert not field.uncalibrated and not field.training
     assert all(torch.equal(weights[name], p) for name, p in field.named_parameters())
     assert field.depth_net is not None
-    norm = field.depth_net.stages[0][0].norm1
     seen: list[torch.Tensor] = []
-    norm.register_forward_hook(lambda _m, _i, out: seen.append(out))
+    field.depth_net.stages[0][0].norm1.register_forward_hook(lambda _m, _i, out: seen.append(out))
     with torch.no_grad():
         field(views(8))
     # Running variances count one pixel less than the normalisation does, so not quite 1.
-    torch.testing.assert_close(seen[0].mean((0, 2, 3)), torch.zeros(8), atol=1e-4, rtol=0)
-    torch.testing.assert_close(seen[0].var((0, 2, 3)), torch.ones(8), atol=1e-2, rtol=0)
+    assert seen[0].mean((0, 2, 3)).abs().max() < 1e-4 and (seen[0].var((0, 2, 3)) - 1).abs().max() < 1e-2
 
 
 def without_depth(given: SourceViews, *index: int) -> SourceViews:
@@ -90,7 +77,6 @@ def without_depth(given: SourceViews, *index: int) -> SourceViews:
 def test_each_view_goes_through_the_network_that_fits_it_and_comes_back_in_its_place():
     field = encoder().eval()
     calibrate(field, views(4))
-    assert field.depth_net is not None
     mixed = field(without_depth(views(4), 1, 2))
     with_depth, colours = field(views(4)), field(without_depth(views(4), 0, 1, 2, 3))
     torch.testing.assert_close(mixed[[0, 3]], with_depth[[0, 3]], atol=1e-5, rtol=1e-4)
@@ -98,42 +84,18 @@ def test_each_view_goes_through_the_network_that_fits_it_and_comes_back_in_its_p
     assert not torch.allclose(with_depth[1], colours[1], atol=1e-2)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        EncoderConfig(channels=(), blocks=()),
-        EncoderConfig(channels=(8, 8), blocks=(1,)),
-        EncoderConfig(channels=(8, 0), blocks=(1, 1)),
-    ],
-)
-def test_a_shape_that_cannot_be_built_is_refused(config: EncoderConfig):
+@pytest.mark.parametrize(("channels", "blocks"), [((), ()), ((8, 8), (1,)), ((8, 0), (1, 1))])
+def test_a_shape_that_cannot_be_built_is_refused(channels: tuple[int, ...], blocks: tuple[int, ...]):
     with pytest.raises(ConfigError, match="channels and blocks"):
-        encoder(config)
-
-
-def computed(given: SourceViews, spread: float) -> SourceViews:
-    return replace(given, depth_sigma_m=spread * given.depth_m)
+        encoder(EncoderConfig(channels=channels, blocks=blocks))
 
 
 def test_computed_depth_is_shown_only_to_an_encoder_that_has_learned_from_it():
     given = views(2)
-    none = without_depth(given, 0, 1)
-    assert torch.equal(encoder()(computed(given, 0.02)), encoder()(none))
+    none, computed = without_depth(given, 0, 1), replace(given, depth_sigma_m=0.02 * given.depth_m)
+    assert torch.equal(encoder()(computed), encoder()(none))
     shown = encoder(msgspec.structs.replace(SMALL_ENCODER, computed_depth=True))
-    assert torch.equal(shown(computed(given, 0.02)), shown(given))
-    assert not torch.equal(shown(computed(given, 0.02)), shown(none))
-
-
-def test_strided_convolutions_look_where_tensorflow_s_do():
-    """Of an even size the middle of the first output's window is pixel 1, of an odd one pixel 0."""
-    for size, middle in ((8, 1), (9, 0)):
-        stem = EfficientNetLite0(1).stem
-        with torch.no_grad():
-            stem.weight.zero_()
-            stem.weight[:, :, 1, 1] = 1
-        image = torch.zeros(1, 3, size, size)
-        image[0, :, middle, middle] = 1
-        assert stem(image)[0, 0, 0, 0] == 3
+    assert torch.equal(shown(computed), shown(given)) and not torch.equal(shown(computed), shown(none))
 
 
 def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
@@ -151,18 +113,12 @@ def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
     assert "depth_net.stem.weight" in changed and "depth_net.stages.0.0.norm1.running_mean" in changed
 
 
-def looking_down(pitch: float) -> torch.Tensor:
-    """Up (3,) in the axes of a camera that is inclined downwards."""
-    return torch.tensor([0.0, -math.cos(pitch), -math.sin(pitch)])
-
-
 def floor_depth(pitch: float) -> torch.Tensor:
-    """Depth (1, H, W) of a level floor below the camera; 0 where the ray does not fall."""
+    """Depth (1, H, W) of a level floor below a camera that is inclined downwards; 0 where the ray does not fall."""
     v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     ray = torch.stack(((u - 79.5) / 110, (v - 59.5) / 110, torch.ones_like(u)))
-    falls = -torch.einsum("ihw,i->hw", ray, looking_down(pitch))
-    depth = torch.where(falls > 0.05, HEIGHT_M / falls.clamp_min(0.05), 0)
-    return depth[None]
+    falls = torch.einsum("ihw,i->hw", ray, torch.tensor([0.0, math.cos(pitch), math.sin(pitch)]))
+    return torch.where(falls > 0.05, HEIGHT_M / falls.clamp_min(0.05), 0)[None]
 
 
 @pytest.mark.parametrize("pitch_deg", [0, 15, 40])
@@ -176,9 +132,7 @@ def test_a_level_floor_is_level_at_height_nought_and_faces_up(pitch_deg: int):
     inner = level != 0  # beside holes and at the border there is no normal
     assert inner.float().mean() > 0.3
     assert float(level[inner].min()) > 0.999
-    torch.testing.assert_close(
-        facing[inner], torch.full_like(facing[inner], -math.sin(math.radians(pitch_deg))), atol=2e-2, rtol=0
-    )
+    assert (facing[inner] + math.sin(math.radians(pitch_deg))).abs().max() < 2e-2
 
 
 def test_without_depth_there_is_nothing_and_holes_stay_holes():
@@ -186,6 +140,4 @@ def test_without_depth_there_is_nothing_and_holes_stay_holes():
     depth = floor_depth(0.5)
     depth[0, 70:80, 60:90] = 0
     maps = surface_maps(torch.cat((depth, torch.zeros_like(depth))), K.expand(2, 3, 3))
-    assert not maps[0, :, 70:80, 60:90].any()
-    assert not maps[1].any()
-    assert torch.isfinite(maps).all()
+    assert torch.isfinite(maps).all() and not maps[0, :, 70:80, 60:90].any() and not maps[1].any()

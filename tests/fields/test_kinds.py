@@ -35,7 +35,7 @@ def test_unknown_kinds_and_configs_of_others_are_refused():
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
+def test_every_kind_goes_through_a_checkpoint_and_to_another_label_set_by_class_name(name: str, tmp_path):
     field = tiny(name)
     save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors")
     loaded = load_checkpoint(tmp_path / "w.safetensors").model
@@ -43,11 +43,6 @@ def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
     for key, tensor in field.state_dict().items():
         half = field.stored_in_half and tensor.dtype == torch.float32
         assert torch.equal(loaded.state_dict()[key], tensor.half().float() if half else tensor)
-
-
-@pytest.mark.parametrize("name", TINY)
-def test_every_kind_is_adapted_to_another_label_set_by_class_name(name: str):
-    field = tiny(name)
     adapted = adapt_model(field, make_label_set("other", ["c", "new", "a"]))
     for key in field.class_rows:
         old, new = field.state_dict()[key], adapted.state_dict()[key]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import (
     NOTHING,
@@ -73,20 +71,6 @@ def test_a_kind_says_what_samples_mean_and_only_where_something_is() -> None:
     assert (render.logits.argmax(1) == torch.where(x > 0, 2, 1))[sure].all()
     away = field.render(wall_rays(pose_at(0.0, 3.1415), step=31), field.encode(wall_sources(POSES[:1])))
     assert not away.known.any()
-
-
-@pytest.mark.parametrize("features", [0, 8])
-def test_a_file_holds_the_grid_as_float16_and_gives_it_back(features: int, tmp_path) -> None:
-    field = wall_field(features)
-    save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors")
-    loaded = load_checkpoint(tmp_path / "w.safetensors").model
-    assert isinstance(loaded, GridField) and loaded.config == field.config and loaded.fitted
-    assert torch.equal(loaded.grid.occupied, field.grid.occupied)
-    torch.testing.assert_close(loaded.grid.values, field.grid.values, atol=1e-2, rtol=1e-3)
-    voxels = field.grid.values.numel()
-    assert (tmp_path / "w.safetensors").stat().st_size < 2 * voxels * (1.5 if features else 1.2) + 100_000
-    rays, sources = wall_rays(pose_at(0.0), step=31), field.encode(wall_sources(POSES[:1]))
-    torch.testing.assert_close(loaded.render(rays, sources).rgb, field.render(rays, sources).rgb, atol=5e-3, rtol=0)
 
 
 def test_a_resampled_grid_shows_the_same() -> None:

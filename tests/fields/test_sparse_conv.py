@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from torch.nn.functional import conv3d, conv_transpose3d
 
@@ -21,10 +20,6 @@ def _kernel(weight: torch.Tensor, side: int, out_first: bool = True) -> torch.Te
     return weight.view(side, side, side, *weight.shape[1:]).permute(*((4, 3) if out_first else (3, 4)), 0, 1, 2)
 
 
-def dense_conv(conv: SubmanifoldConv, x: torch.Tensor) -> torch.Tensor:
-    return conv3d(x, _kernel(conv.weight, 3), conv.bias, padding=1)
-
-
 def test_down_and_up_over_all_cells_are_the_dense_ones() -> None:
     torch.manual_seed(0)
     down, up = Down(3, 5), Up(5, 3)
@@ -37,20 +32,7 @@ def test_down_and_up_over_all_cells_are_the_dense_ones() -> None:
     torch.testing.assert_close(up(coarse, level), finer[0].reshape(3, -1).T, atol=1e-5, rtol=1e-5)
 
 
-def test_absent_cells_count_as_zeros() -> None:
-    torch.manual_seed(2)
-    rng = np.random.default_rng(0)
-    every = _all_cells()
-    kept = np.sort(rng.choice(len(every), len(every) // 3, replace=False))
-    conv = SubmanifoldConv(3, 4)
-    x = torch.zeros(len(every), 3)
-    x[kept] = torch.randn(len(kept), 3)
-    sparse = conv(x[kept], cell_levels(every[kept], 1)[0])
-    dense = dense_conv(conv, x.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
-    torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
-
-
-def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
+def test_absent_cells_count_as_zeros_and_so_do_their_gradients() -> None:
     torch.manual_seed(3)
     rng = np.random.default_rng(0)
     every = _all_cells()
@@ -59,7 +41,9 @@ def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
     x = torch.randn(len(kept), 3, requires_grad=True)
     sparse = conv(x, cell_levels(every[kept], 1)[0])
     full = torch.zeros(len(every), 3).index_copy(0, torch.from_numpy(kept), x)
-    dense = dense_conv(conv, full.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
+    dense = conv3d(full.T.reshape(1, 3, *SIZE), _kernel(conv.weight, 3), conv.bias, padding=1)
+    dense = dense[0].reshape(4, -1).T[kept]
+    torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
     mine = torch.autograd.grad((sparse * weight).sum(), [x, conv.weight])
     theirs = torch.autograd.grad((dense * weight).sum(), [x, conv.weight])
     for a, b in zip(mine, theirs, strict=True):
@@ -67,13 +51,3 @@ def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
     # Where the input wants no gradient, that of the weights is found in another way.
     alone = torch.autograd.grad((conv(x.detach(), cell_levels(every[kept], 1)[0]) * weight).sum(), conv.weight)[0]
     torch.testing.assert_close(alone, theirs[1], atol=1e-4, rtol=1e-4)
-
-
-@pytest.mark.parametrize("shift", [0, 3])
-def test_levels_name_children_and_parents(shift: int) -> None:
-    cells = _all_cells()[::7] + shift
-    fine, coarse = cell_levels(cells, 2)
-    assert (coarse.cells[fine.parent.numpy()] == cells >> 1).all()
-    corner = np.stack((fine.corner >> 2, fine.corner >> 1 & 1, fine.corner & 1), -1)
-    assert (2 * coarse.cells[fine.parent.numpy()] + corner == cells).all()
-    assert fine.parents == len(coarse.cells)

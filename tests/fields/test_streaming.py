@@ -14,13 +14,11 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
-from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import LABELS, POSES
 
-LABELS = make_label_set("test", ["a", "b", "c"])
 ONE_STAGE = EncoderConfig(channels=(8,), blocks=(1,), depth=True)
-POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 BEHIND = [pose_at(1.5), pose_at(0.0, 3.0)]  # a camera that sees part of the wall, and one that looks away from it
 OUTPUTS = ("logits", "depth_m", "opacity", "rgb", "entropy")
 
@@ -62,21 +60,13 @@ def assert_equal(fast: FieldRender, reference: FieldRender, atol: float = 2e-5) 
         torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=atol, rtol=2e-5, msg=name)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"intra_view_attention": False},
-        {"cross_view_attention": False},
-        {"intra_view_attention": False, "cross_view_attention": False},
-    ],
-)
+@pytest.mark.parametrize(("intra", "cross"), [(True, True), (False, True), (True, False), (False, False)])
 @pytest.mark.parametrize("tokens", ["surface", "samples"])
 @pytest.mark.parametrize("guided", [True, False])
-def test_it_renders_what_the_reference_renders(changes: dict[str, Any], guided: bool, tokens: str):
+def test_it_renders_what_the_reference_renders(intra: bool, cross: bool, guided: bool, tokens: str):
     rays = wall_rays(pose_at(0.2, 0.3), step=3)
     z = sample_guided(rays, SamplingConfig()) if guided else sample_inverse_depth(rays.near_m, rays.far_m, 24)
-    field = random_field(**{"tokens": tokens, "intra_view_attention": True} | changes)
+    field = random_field(tokens=tokens, intra_view_attention=intra, cross_view_attention=cross)
     assert_equal(*render_both(field, labelled(wall_sources([*POSES, *BEHIND])), rays, z))
 
 

@@ -16,18 +16,12 @@ from semantic_mapper.fields.volume import (
 from semantic_mapper.types import RayBatch
 
 
-def test_weights_match_a_hand_computed_ray():
-    sigma = torch.tensor([[0.0, 1.0, 2.0]])
-    delta = torch.tensor([[0.5, 0.5, 0.25]])
-    weights = compositing_weights(sigma, delta)
+def test_weights_and_lengths_match_hand_computed_rays():
+    weights = compositing_weights(torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([[0.5, 0.5, 0.25]]))
     first, second = 1 - math.exp(-0.5), math.exp(-0.5) * (1 - math.exp(-0.5))
     torch.testing.assert_close(weights, torch.tensor([[0.0, first, second]]))
-
-
-def test_interval_lengths_are_metric_along_an_oblique_ray():
-    z = torch.tensor([[1.0, 2.0, 4.0]])
-    direction = torch.tensor([[1.0, 0.0, 1.0]])  # 45 degrees: one metre of z is sqrt(2) metres of ray
-    delta = interval_lengths(z, direction.norm(dim=-1))
+    z, oblique = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([[1.0, 0.0, 1.0]])  # one metre of z is sqrt(2) of ray
+    delta = interval_lengths(z, oblique.norm(dim=-1))
     torch.testing.assert_close(delta, math.sqrt(2) * torch.tensor([[1.0, 2.0, 2.0]]))
 
 
@@ -38,17 +32,6 @@ def test_volume_rendering_passes_gradcheck():
     assert torch.autograd.gradcheck(lambda s, d, v: composite(compositing_weights(s, d), v), (sigma, delta, values))
 
 
-def rays_with_prior(prior: list[float], near: float = 0.3, far: float = 8.0) -> RayBatch:
-    count = len(prior)
-    return RayBatch(
-        torch.zeros(count, 3),
-        torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3),
-        torch.full((count,), near),
-        torch.full((count,), far),
-        torch.tensor(prior),
-    )
-
-
 def test_inverse_depth_midpoints_match_hand_computed_values():
     z = sample_inverse_depth(torch.tensor([1.0]), torch.tensor([4.0]), 3)
     # 1 / z from 1 to 0.25 in three intervals: midpoints 0.875, 0.625, 0.375
@@ -57,7 +40,8 @@ def test_inverse_depth_midpoints_match_hand_computed_values():
 
 def test_guided_samples_surround_the_prior_and_leave_some_in_free_space():
     config = SamplingConfig(guided=8, free_space=2, guided_sigma=0.02, guided_floor_m=0.04)
-    z = sample_guided(rays_with_prior([2.0]), config)[0]
+    one = torch.ones(1)
+    z = sample_guided(RayBatch(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]), 0.3 * one, 8 * one, 2 * one), config)[0]
     assert (z[1:] > z[:-1]).all()
     torch.testing.assert_close(z[2:], 2.0 + torch.linspace(-0.08, 0.08, 6))
     assert (z[:2] < 1.92).all() and (z[:2] > 0.3).all()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.training.fit import Budget, FitProgress, HeldOut, budget_fraction, cosine_rate, fit
+from semantic_mapper.training.fit import Budget, FitProgress, HeldOut, budget_fraction, fit
 
 
 def held_out(losses: list[float], patience: int = 0) -> HeldOut:
@@ -29,10 +29,6 @@ def test_whichever_budget_is_used_up_first_counts_and_zero_means_none() -> None:
     assert budget_fraction(9, 80.0, steps=0, seconds=0) == 0.0
     with pytest.raises(ConfigError, match="needs a budget"):
         Budget(0, 0)
-
-
-def test_rate_falls_along_half_a_cosine() -> None:
-    assert [cosine_rate(f, 3.0, 1.0) for f in (0, 0.5, 1)] == pytest.approx([3.0, 2.0, 1.0])
 
 
 def test_the_best_weights_of_all_looks_are_kept_and_reported() -> None:

@@ -15,13 +15,12 @@ from semantic_mapper.config import GridConfig
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import GridField
-from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import Budget
 from semantic_mapper.training.grid_fit import fit_grid, held_out_psnr, render_frame
-from semantic_mapper.training.scene_box import scene_box, sparse_points
+from semantic_mapper.training.scene_box import scene_box
 from semantic_mapper.training.views import frame_rays
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_frames
@@ -139,18 +138,3 @@ def test_without_depth_the_box_holds_what_matched_features_show() -> None:
     sides = np.diff(measured, axis=0)[0]
     assert (np.abs(corners(box) - measured) < 0.5 * sides).all()
     assert 2e6 < np.prod(box.shape) < 3e6
-
-
-def test_triangulated_points_lie_on_the_surface() -> None:
-    frames = tiny_frames()
-    points = sparse_points(frames)
-    assert len(points) > 30
-    off = []
-    for frame in frames:
-        in_camera = transform(invert_pose(frame.T_world_camera), points)
-        seen, v, u = nearest_pixels(in_camera, frame.intrinsics)
-        assert frame.depth_m is not None
-        depth = frame.depth_m[v[seen], u[seen]]
-        off.append(np.abs(in_camera[seen, 2] - depth)[depth > 0] / depth[depth > 0])
-    assert np.median(np.concatenate(off)) < 0.1
-    assert len(sparse_points([replace(f, T_world_camera=frames[0].T_world_camera) for f in frames])) == 0

@@ -117,14 +117,6 @@ def test_a_fit_repeats_bit_for_bit_and_comes_back_from_its_file(tmp_path) -> Non
     assert isinstance(other, IRT) and other.shape.variant == "B" and other.shape.grid == field.shape.grid
 
 
-def test_a_stopped_fit_gives_the_best_so_far() -> None:
-    told: list[FitProgress] = []
-    config = msgspec.structs.replace(SMALL, steps=60)
-    checkpoint = fit_irt(scene(), None, config, told.append, lambda: len(told) >= 130)
-    assert [round(told[i].fraction, 2) for i in (59, 119)] == [0.35, 0.5]  # geometry, then features
-    assert 0 < checkpoint.recipe["steps"] < 60 and 0 <= checkpoint.recipe["held_out_accuracy"] <= 1
-
-
 def test_what_cannot_teach_is_refused() -> None:
     unlabelled = [replace(f, label=None) for f in scene()]
     with pytest.raises(FrameError, match="no frame has a label"):

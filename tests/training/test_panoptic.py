@@ -21,7 +21,7 @@ from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
-from semantic_mapper.training.panoptic import boxes_in_view, held_out_unlabelled, semantic_losses
+from semantic_mapper.training.panoptic import boxes_in_view, semantic_losses
 from semantic_mapper.training.views import frame_rays, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
 from tests.training.two_planes import two_planes
@@ -221,14 +221,6 @@ def test_boxes_that_no_frame_can_see_are_left_out_wherever_they_move() -> None:
     assert boxes_in_view([moving, later, away], scene()).tolist() == [True, False, False]
     with pytest.raises(ConfigError, match=r"boxes lie from \(0.00, 60.00, .*cameras from .*world frame"):
         boxes_in_view([primitive_of(beside)], scene())
-
-
-def test_frames_without_labels_are_those_that_are_held_out() -> None:
-    one, none = scene()[0], scene(labelled=False)
-    frames = held_out_unlabelled([*none[1:5], one, *none[5:], *scene()[1:3]], 3)
-    assert len(frames) == 10 and [f.label is None for f in frames[2::3]] == [True] * 3
-    assert [f.label is not None for f in frames].count(True) == 3
-    assert held_out_unlabelled(scene(), 3) == list(scene())
 
 
 @pytest.mark.parametrize("joint", [0, 2])

@@ -1,7 +1,5 @@
 """Which frames to label, and which next."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -37,16 +35,6 @@ def test_suggestions_without_depth_are_spread_over_time():
     assert [s.index for s in suggest_frames(frames, 1, [0, 1])] == [8]
     assert [s.index for s in suggest_frames(frames, 2, [8])] == [0, 4]
     assert len(suggest_frames(frames, 99)) == 9
-
-
-def test_suggested_frames_of_a_room_show_more_than_others():
-    frames = tiny_frames(6)
-    candidates = [candidate_from_frame(f) for f in frames]
-    found = suggest_frames(candidates, 6)
-    shown, gains = [s.shown for s in found], [s.gain for s in found]
-    assert gains == sorted(gains, reverse=True) and shown == sorted(shown) and shown[-1] == pytest.approx(1)
-    again = suggest_frames([candidate_from_frame(dataclasses.replace(f, label=None)) for f in frames], 6)
-    assert again == found, "labels play no part"
 
 
 def test_choice_is_decided_by_the_seed_and_gives_as_many_as_asked():

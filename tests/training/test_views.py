@@ -4,18 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import pick_views
 from semantic_mapper.training.losses import semantic_loss
 from semantic_mapper.training.views import (
     LabelledView,
     draw_pixels,
-    query_rays,
-    view_from_frame,
     view_overlap,
 )
 from semantic_mapper.types import CameraIntrinsics
-from tests.small import tiny_frames
 
 CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
 
@@ -36,20 +32,6 @@ def test_balanced_draws_show_rare_classes_as_often_as_common_ones():
     assert abs((drawn == 1).float().mean() - 0.5) < 0.05
     uniform = channel.flatten()[draw_pixels(channel, 2000, 0.0, generator, 5)]
     assert (uniform == 1).float().mean() < 0.02
-
-
-def test_query_rays_carry_the_targets_of_their_pixels():
-    view = view_from_frame(tiny_frames()[0], ROOMS, 96)
-    flat = torch.tensor([0, 97, 3000])
-    rays, targets = query_rays(view, flat, near_m=0.3, far_m=8, prior=None)
-    v, u = 3000 // 96, 3000 % 96
-    assert targets.channel[2] == view.channel[v, u]
-    torch.testing.assert_close(targets.rgb[2], view.rgb[:, v, u])
-    point = rays.origin[2] + view.depth_m[v, u] * rays.direction[2]
-    camera = torch.linalg.inv(view.T_world_camera) @ torch.cat((point, torch.ones(1)))
-    k = view.intrinsics
-    torch.testing.assert_close(camera[2], view.depth_m[v, u])
-    torch.testing.assert_close(k.fx * camera[0] / camera[2] + k.cx, torch.tensor(float(u)), atol=1e-3, rtol=1e-4)
 
 
 def view(x: float, *, turned: bool = False, depth_m: float = 2.0) -> LabelledView:
