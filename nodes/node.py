@@ -15,18 +15,9 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_bytes
+from semantic_mapper.nodes import process
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
-from semantic_mapper.nodes.process import (
-    EXIT_LOSS,
-    FAILURE_EVENT,
-    JOB_PREFIX,
-    LOSS_EVENT,
-    STOP_SIGNAL,
-    StopRequest,
-    failure_message,
-    prepare_process,
-)
 from semantic_mapper.transport.endpoints import default_endpoint
 
 _log = structlog.get_logger(__name__)
@@ -41,7 +32,7 @@ class NodeContext:
     name: str  # of the node
     endpoints: dict[str, str]  # by node name
     subscribers: int  # how many listen to its frames
-    stop: StopRequest  # true once somebody has requested its end
+    stop: process.StopRequest  # true once somebody has requested its end
     heartbeat: HeartbeatWriter  # tells the launcher how far the node is
     restarts: int = 0  # how often its launcher has restarted it
     folder: Path | None = None  # of the launch's notes and sockets; None where it was started by hand
@@ -83,7 +74,7 @@ def run_node(kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str |
         kind: Of its options.
         work: Does it all; looks at ``stop`` often. Returns what is lost, in words, if anything.
     """
-    prepare_process()
+    process.prepare_process()
     code = 1
     try:
         if len(sys.argv) != 2:
@@ -94,28 +85,28 @@ def run_node(kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str |
         heartbeat = HeartbeatWriter(job.heartbeat_fd)
         heartbeat.start()
         options = convert_config(job.options, kind, f"node '{job.name}'")
-        signals = (STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
+        signals = (process.STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
         if job.restartable and kind is CameraOptions:
             # Its last words would be that the stream has ended, and its readers would end, too: it drops out instead.
-            signals = (STOP_SIGNAL,)
+            signals = (process.STOP_SIGNAL,)
             for signum in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(signum, signal.SIG_DFL)
-        with StopRequest(patient=True, signals=signals) as stop:
+        with process.StopRequest(patient=True, signals=signals) as stop:
             folder = Path(job.folder) if job.folder else None
             launched = (job.restarts, folder, job.restartable)
             losses = work(NodeContext(job.name, job.endpoints, job.subscribers, stop, heartbeat, *launched), options)
             # A request that comes from here on finds a process that ends anyway, and must not hide how it ended.
-            signal.signal(STOP_SIGNAL, signal.SIG_IGN)
+            signal.signal(process.STOP_SIGNAL, signal.SIG_IGN)
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
         if losses and not code:
-            _log.error(LOSS_EVENT, lost=losses)
-            code = EXIT_LOSS
+            _log.error(process.LOSS_EVENT, lost=losses)
+            code = process.EXIT_LOSS
     except SemanticMapperError as error:
-        _log.error(FAILURE_EVENT, error=str(error))
+        _log.error(process.FAILURE_EVENT, error=str(error))
     except Exception as error:
-        if not (message := failure_message(error)):
+        if not (message := process.failure_message(error)):
             raise
-        _log.error(FAILURE_EVENT, error=message)
+        _log.error(process.FAILURE_EVENT, error=message)
     sys.exit(code)
 
 
@@ -123,8 +114,8 @@ def read_job(argument: str) -> NodeJob:
     """What a node is to do, of JSON, or "fd:N" of an open file with it; ``ConfigError`` where it is neither."""
     text: str | bytes = argument
     try:
-        if argument.startswith(JOB_PREFIX):
-            with open(int(argument.removeprefix(JOB_PREFIX)), "rb") as file:
+        if argument.startswith(process.JOB_PREFIX):
+            with open(int(argument.removeprefix(process.JOB_PREFIX)), "rb") as file:
                 text = file.read()
         plain = msgspec.json.decode(text)
     except (ValueError, OSError) as error:

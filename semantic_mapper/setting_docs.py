@@ -73,7 +73,8 @@ def without_bounds(declared: Any) -> tuple[Any, float | None, float | None]:
     if get_origin(declared) in (Union, UnionType):
         inner = [part for part in get_args(declared) if part is not type(None)]
         if len(inner) == 1:
-            return without_bounds(inner[0])
+            declared, least, most = without_bounds(inner[0])
+            return declared, low if least is None else least, high if most is None else most
     return declared, low, high
 
 

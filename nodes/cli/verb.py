@@ -90,11 +90,6 @@ class Options(msgspec.Struct, frozen=True):
             for field in msgspec.structs.fields(cls)
         ]
 
-    @classmethod
-    def bounds(cls) -> dict[str, tuple[float | None, float | None]]:
-        """The least and the largest value of each, by parameter."""
-        return {name: without_bounds(kind)[1:] for name, kind in get_type_hints(cls, include_extras=True).items()}
-
 
 class SettingOptions:
     """Options that set settings of ``kind``, with ``--config`` and ``--set`` for the others.
@@ -120,19 +115,14 @@ class SettingOptions:
             setting = declared[name]
             default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
             info = typer.Option(option, help=f"{_sentence(setting.text)}  [default: {default}]", show_default=False)
-            found.append(_parameter(_parameter_name(option), setting.type | None, info, None))
+            bounded = Annotated[setting.type, msgspec.Meta(ge=setting.low, le=setting.high)]
+            found.append(_parameter(_parameter_name(option), bounded, info, None))
         listed = typer.Option("--config", help="TOML file of settings (docs/settings.md)")
         return [
             *found,
             _parameter("config", Path | None, listed, None),
             _parameter("set", SetOption, typer.Option(), None),
         ]
-
-    @classmethod
-    def bounds(cls) -> dict[str, tuple[float | None, float | None]]:
-        """As of ``Options``."""
-        declared = {setting.name: (setting.low, setting.high) for setting in settings_of(cls.kind)}
-        return {_parameter_name(option): declared[name] for option, name in cls.options.items()}
 
     @property
     def given(self) -> dict[str, Any]:
@@ -193,13 +183,11 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     texts = comments_of_parameters(function)
     groups: dict[str, type[Options | SettingOptions]] = {}
     parameters: list[inspect.Parameter] = []
-    bounds = {name: without_bounds(parameter.annotation)[1:] for name, parameter in signature.parameters.items()}
     for name, parameter in signature.parameters.items():
         kind = parameter.annotation
         if isinstance(kind, type) and issubclass(kind, Options | SettingOptions):
             groups[name] = kind
             parameters += kind.parameters()
-            bounds |= kind.bounds()
         elif name != "output":
             make = _option if parameter.kind is inspect.Parameter.KEYWORD_ONLY else _argument
             parameters.append(make(name, kind, parameter.default, texts.get(name, "")))
@@ -208,11 +196,13 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     if with_json:
         parameters.append(_parameter("json", JsonOption, typer.Option(), False))
 
+    bounds = {parameter.name: without_bounds(parameter.annotation)[1:] for parameter in parameters}
+
     @functools.wraps(function)
     def command(**values: Any) -> None:
         prepare_process(verbose=Settings.verbose)
         for name, value in values.items():
-            _check_bounds(name, value, *bounds.get(name, (None, None)))
+            _check_bounds(name, value, *bounds[name])
         try:
             for name, group in groups.items():
                 values[name] = group(**{option.name: values.pop(option.name) for option in group.parameters()})
@@ -273,8 +263,8 @@ def _parameter(name: str, kind: Any, info: ParameterInfo, default: Any) -> inspe
     if given is not None:
         given.help, given.show_default = given.help or info.help, info.show_default
     else:
-        declared = without_bounds(kind)[0]
-        kind = Annotated[declared | None if default is None else declared, info]
+        declared, low, high = without_bounds(kind)
+        kind = Annotated[declared | None if default is None else declared, info, msgspec.Meta(ge=low, le=high)]
     default = inspect.Parameter.empty if default is msgspec.NODEFAULT else default
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,15 +12,8 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, WeightsOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.launcher import running
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
-from semantic_mapper.nodes.launcher.running import (
-    QUERY_SOCKET,
-    LaunchView,
-    launch_folder,
-    node_endpoints,
-    read_launch_note,
-    socket_in_launch,
-)
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import DATA_PORT, WEB_PORT, WebViewer
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
@@ -102,41 +94,33 @@ def view(
             time.sleep(POLL_S)
 
 
-class _Page(ExitStack):
-    """The page, served from when there is something to show on it until the context ends."""
+class _Page(WebViewer):
+    """The page, whose address is shown when there is something on it."""
 
     def __init__(self, port: int, output: Output) -> None:
-        super().__init__()
-        self._port = port
+        super().__init__(port, DATA_PORT if port else 0)
         self._output = output
-        self._viewer: WebViewer | None = None
-
-    @property
-    def alive(self) -> bool:
-        """Whether it is served."""
-        return self._viewer is not None and self._viewer.alive
 
     def begin(self) -> RecordingStream:
-        """Serve it, say where, and tell what writes on it."""
+        """What writes on it."""
         from semantic_mapper.replay.exporters.rerun_log import recording_server
 
-        self._viewer = self.enter_context(WebViewer(self._port, DATA_PORT if self._port else 0))
-        self._output.address("watch at", self._viewer.page_url)
-        stream = recording_server(self._viewer.data_url)
+        self._output.address("watch at", self.page_url)
+        stream = recording_server(self.data_url)
         self.callback(stream.disconnect)  # before its server ends, which it would complain of at length
         return stream
 
 
 def _find_live(source: str, remote: Remote) -> Live:
     """Endpoints of a running launch, or of a mapper anywhere."""
-    folder = None if "://" in source else launch_folder(source)
+    folder = None if "://" in source else running.launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live
 
     if folder is None:
         return Live(source, (), remote.identity())
-    nodes = node_endpoints(folder)
-    streams = sum(camera in nodes for camera in read_launch_note(folder).names("camera"))
-    return Live(f"ipc://{folder}/{QUERY_SOCKET}", tuple(nodes.values()), streams=streams)
+    nodes = running.node_endpoints(folder)
+    streams = sum(camera in nodes for camera in running.read_launch_note(folder).names("camera"))
+    return Live(f"ipc://{folder}/{running.QUERY_SOCKET}", tuple(nodes.values()), streams=streams)
 
 
 def _show_log(path: Path, weights: Path | None, config: Path | None, page: _Page, stop: StopRequest) -> None:
@@ -151,8 +135,8 @@ def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> N
     """A running launch as a table."""
     if not output.console.is_terminal:
         output.console.width = FILE_WIDTH
-    endpoint = socket_in_launch(place, STATUS_SOCKET)
-    view = LaunchView()
+    endpoint = running.socket_in_launch(place, STATUS_SOCKET)
+    view = running.LaunchView()
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
         deadline = time.monotonic() + ANSWER_S
         while not view.complete:

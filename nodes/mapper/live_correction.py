@@ -121,10 +121,8 @@ class LiveCorrection:
         stamps, poses = request.stamps_ns, request.poses
         camera, names = request.camera.astype(np.int64), list(request.cameras)
         if not (stamps.shape == camera.shape == poses.shape[:1] and poses.shape[1:] == (4, 4)):
-            raise CodecError(
-                f"correct_poses: stamps of shape {stamps.shape}, cameras {camera.shape} and poses {poses.shape} do not "
-                "go together; expected (N,), (N,) and (N, 4, 4)"
-            )
+            shapes = f"{stamps.shape}, {camera.shape} and {poses.shape}"
+            raise CodecError(f"correct_poses: stamps, cameras, poses of shapes {shapes}, not (N,), (N,), (N, 4, 4)")
         if len(set(names)) < len(names) or ("" in names and len(names) > 1) or (camera >= len(names)).any():
             raise CodecError(f"correct_poses: cameras {names} must differ, and each pose be of one of them")
         if len(set(zip(camera.tolist(), stamps.tolist(), strict=True))) < len(stamps):

@@ -17,19 +17,11 @@ from semantic_mapper.mapping.map_types import SCALE_FIX
 from semantic_mapper.mapping.moving import KEPT_S
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
+from semantic_mapper.nodes.mapper import saved_map
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.nodes.mapper.saved_map import (
-    Autosave,
-    continue_map,
-    forbid,
-    keep_earlier,
-    note_sessions,
-    noted_sessions,
-    resume_map,
-    stored_settings,
-)
+from semantic_mapper.nodes.mapper.saved_map import Autosave
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, StatusReport
@@ -156,13 +148,13 @@ class MapperNode:
             self._session.source = self._streams.source
             return
         if self._options.delivery == "newest":
-            keep_earlier(self._context, self._out / MAP_NAME)
+            saved_map.keep_earlier(self._context, self._out / MAP_NAME)
         clear_results(self._out)
         self._session = MapSession(
             self._bundle, stream_labels=info.label_set, source=info.source, own_first=not self._options.map
         )
         if self._bundle.voxel_map.frames:
-            self._session.odometry_sessions.known.update(noted_sessions(self._context))
+            self._session.odometry_sessions.known.update(saved_map.noted_sessions(self._context))
         _log.info("stream_begins", source=info.source, frames=info.frame_count)
 
     def _map(self, frame: PosedFrame) -> None:
@@ -176,7 +168,7 @@ class MapperNode:
         before = len(session.odometry_sessions.known)
         results = session.process(frame)
         if len(session.odometry_sessions.known) != before:
-            note_sessions(self._context, session.odometry_sessions.known)
+            saved_map.note_sessions(self._context, session.odometry_sessions.known)
         if not results and session.odometry_sessions.held:  # a player in lockstep waits for an answer to every frame
             self._refuse(frame, session.odometry_sessions.warning)
         self._capture_age_s = (time.monotonic_ns() - frame.stamp_ns) / 1e9
@@ -194,7 +186,8 @@ class MapperNode:
         """Frames after a correction may still come with poses from before it: a restarted mapper could not tell."""
         if not self._corrected and self._pipeline.corrector.status.poses:
             self._corrected = True
-            noted = forbid(self._context, "poses had been corrected, which only the mapper that was killed knew of")
+            why = "poses had been corrected, which only the mapper that was killed knew of"
+            noted = saved_map.forbid(self._context, why)
             if not noted and self._options.save_every_s:
                 self._autosave.end("poses were corrected, and no note could say so to a mapper that replaces this one")
 
@@ -294,10 +287,10 @@ def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
     saved = None
     if options.map:
         file = map_path(Path(options.map))
-        config = stored_settings(config, path, options.voxel_size_m, file)
+        config = saved_map.stored_settings(config, path, options.voxel_size_m, file)
         saved = VoxelMap.load(file, config=config.voxel_map)
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
-    resumed = resume_map(context, Path(options.out) / MAP_NAME, bundle.voxel_map)
+    resumed = saved_map.resume_map(context, Path(options.out) / MAP_NAME, bundle.voxel_map)
     if saved is not None:
-        continue_map(bundle.voxel_map, saved, options.map)
+        saved_map.continue_map(bundle.voxel_map, saved, options.map)
     return bundle, resumed

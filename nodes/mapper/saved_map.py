@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import CancelledError
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -31,10 +32,6 @@ _NO_FILE = "none"
 _RESULTS = ("map.npz", "map.ply", "overview.png", "report.html", "summary.json")
 
 _log = structlog.get_logger(__name__)
-
-
-class _GivenUpError(Exception):
-    """The mapper ends, and writes its map itself."""
 
 
 class Autosave:
@@ -92,12 +89,12 @@ class Autosave:
         def rest() -> None:
             nonlocal worked_since
             if self._ending.wait(REST_FRACTION * (time.monotonic() - worked_since)):
-                raise _GivenUpError
+                raise CancelledError
             worked_since = time.monotonic()
 
         try:
             snapshot.write(self._path, rest)
-        except _GivenUpError:
+        except CancelledError:
             _log.info("autosave_given_up", reason="the mapper ends")
         except Exception as error:  # noqa: BLE001 -- whatever it is, it must be reported, and the next save tried
             self.failure = str(error) if isinstance(error, MapError) else f"{type(error).__name__}: {error}"

@@ -308,7 +308,7 @@ def test_a_request_that_arrives_twice_counts_once(bundle_of):
         assert b"given twice" in raw.ask([b"", *encode_request("correct_poses", again)])[1]
         uneven = msgspec.structs.replace(request, id="b", camera=np.zeros(2, np.uint8))
         answer = raw.ask([b"", *encode_request("correct_poses", uneven)])
-        assert b"do not go together" in answer[1]
+        assert b"stamps, cameras, poses of shapes" in answer[1]
         raw.socket.close()
         while correction.running:
             correction.advance(session, mapped=False)
