@@ -78,36 +78,20 @@ def test_what_a_quality_would_override_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("data", "names"),
+    ("section", "what"),
     [
         ({"seed": "one"}, "seed"),
         ({"sampling": {"mode": "fast"}}, "sampling.mode"),
         ({"voxel_map": {"voxel_size_m": "2cm"}}, "voxel_map.voxel_size_m"),
         ({"voxel_map": 3}, "voxel_map"),
-    ],
-)
-def test_a_value_of_another_type_is_refused_by_its_path(data: dict[str, object], names: str) -> None:
-    with pytest.raises(ConfigError, match=names):
-        convert_config(data, MapperConfig, "mapper.toml")
-
-
-@pytest.mark.parametrize(
-    ("section", "what"),
-    [
         ({"sampling": {"guided": 1}}, "guided"),
-        ({"sampling": {"near_m": 0}}, "near_m"),
         ({"sampling": {"near_m": 2.0, "far_m": 1.0}}, "far_m must lie beyond near_m"),
         ({"sampling": {"guided": 4, "free_space": 3}}, "free_space must leave"),
         ({"keyframes": {"source_views": 17}}, "source_views"),
         ({"keyframes": {"capacity": 0}}, "capacity"),
-        ({"render": {"scale": 0}}, "scale"),
         ({"render": {"rays_per_chunk": -1}}, "rays_per_chunk"),
         ({"voxel_map": {"voxel_size_m": -0.02}}, "voxel_size_m"),
-        ({"voxel_map": {"unknown_below": 1.5}}, "unknown_below"),
-        ({"sampling": {"coarse": 10**9}}, "coarse"),
         ({"sampling": {"far_m": 1e9}}, "far_m"),
-        ({"keyframes": {"capacity": 10**9}}, "capacity"),
-        ({"render": {"rays_per_chunk": 10**12}}, "rays_per_chunk"),
         ({"render": {"encode_width": 10**6}}, "encode_width"),
     ],
 )
@@ -127,10 +111,7 @@ def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], 
         ("[voxel_map]\nvoxel_size_m = nan", "voxel_map.voxel_size_m = nan"),
         ("[voxel_map]\ndepth_max_m = 1e308", r"voxel_map.depth_max_m = 1e\+308"),
         ("[voxel_map]\nvoxel_size_m = 1e-300", "voxel_size_m"),
-        ("[voxel_map]\nmemory_mb = -1", "memory_mb"),
-        ("[sampling]\nguided = 100000", "guided"),
         ('[render]\ndevice = "a\\u0000b"', "render.device holds a NUL character"),
-        ('quality = "unknown field"', "quality"),
         ("k" * 100_000 + " = 1", "unknown key"),
         ("#" * (MAX_FILE_BYTES + 1), "larger than the limit of 1,048,576 bytes"),
     ],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import textwrap
 
 import pytest
 
@@ -16,66 +15,33 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", *FLEET
 """
 
 
+TRY = """
+from pathlib import Path
+from semantic_mapper.errors import SemanticMapperError
+try:
+    {}
+except SemanticMapperError as error:
+    print(error)
+"""
+FILM = "from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film as f"
+VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
+
+
 @pytest.mark.parametrize(
-    ("lines", "expected"),
+    ("code", "expected"),
     [
         ("import semantic_mapper.replay.exporters.map_files, semantic_mapper.nodes.cli.main; print('fine')", "fine"),
+        (TRY.format("import semantic_mapper.replay.exporters.rerun_log"), "pip install 'semantic-mapper[viewer]'"),
         (
-            """
-            from semantic_mapper.errors import SemanticMapperError
-            try:
-                import semantic_mapper.replay.exporters.rerun_log
-            except SemanticMapperError as error:
-                print(error)
-            """,
-            "pip install 'semantic-mapper[viewer]'",
-        ),
-        (
-            """
-            from pathlib import Path
-            from semantic_mapper.errors import SemanticMapperError
-            from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film
-            try:
-                import_film(Path("film.mp4"), Path("film.mcap"), FilmOptions(), print)
-            except SemanticMapperError as error:
-                print(error)
-            """,
+            TRY.format(f"{FILM}; f(Path('a.mp4'), Path('a.mcap'), FilmOptions(), print)"),
             "pip install 'semantic-mapper[sfm]'",
         ),
-        *(
-            (
-                f"""
-                from semantic_mapper.errors import SemanticMapperError
-                try:
-                    import semantic_mapper.nodes.{kind}.server
-                except SemanticMapperError as error:
-                    print(error)
-                """,
-                f"pip install 'semantic-mapper[{kind}]'",
-            )
-            for kind in ("foxglove",)
-        ),
-        *(
-            (
-                f"""
-                from semantic_mapper.nodes.cli.main import app
-                app({arguments!r})
-                """,
-                'pip install "semantic-mapper[fleet]"',
-            )
-            for arguments in (
-                ["fleet", "run", "replay", __file__, "--out", "none"],
-                ["fleet", "table", "none"],
-            )
-        ),
+        (TRY.format("import semantic_mapper.nodes.foxglove.server"), "pip install 'semantic-mapper[foxglove]'"),
+        (VERB.format(["fleet", "run", "replay", __file__, "--out", "none"]), 'pip install "semantic-mapper[fleet]"'),
+        (VERB.format(["fleet", "table", "none"]), 'pip install "semantic-mapper[fleet]"'),
     ],
 )
-def test_what_an_extra_is_needed_for_names_it(lines: str, expected: str) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", HIDDEN + textwrap.dedent(lines)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def test_what_an_extra_is_needed_for_names_it(code: str, expected: str) -> None:
+    command = [sys.executable, "-c", HIDDEN + code]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert expected in run.stdout + run.stderr, run.stderr

@@ -68,13 +68,6 @@ def test_expect_shape_shows_expected_and_actual(shape: tuple[int, ...], pattern:
 # Poses
 
 
-def test_a_rotation_by_a_quarter_turn_is_inverted_by_hand() -> None:
-    T_a_b = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], np.float64)
-    T_b_a = np.array([[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], np.float64)
-    np.testing.assert_allclose(invert_pose(T_a_b), T_b_a)
-    np.testing.assert_allclose(transform(T_a_b, np.array([1.0, 0, 0])), [1, 3, 3])
-
-
 @given(T_a_b=poses(), p_b=hnp.arrays(np.float64, (5, 3), elements=finite))
 def test_a_pose_and_its_inverse_cancel(T_a_b: np.ndarray, p_b: np.ndarray) -> None:
     np.testing.assert_allclose(T_a_b @ invert_pose(T_a_b), np.eye(4), atol=1e-9)
@@ -103,6 +96,7 @@ def test_every_rigid_pose_passes(T: np.ndarray) -> None:
         (lambda T: T.T, "last row"),
         (lambda T: T * 0, "last row"),
         (lambda T: np.vstack((T[:3] * 0, T[3])), "not a rotation"),
+        (lambda T: T + np.diag([0, 0, 1e300], 1), "nearer origin"),
     ],
 )
 def test_what_is_not_a_rigid_pose_is_refused_by_name(mistake, says: str) -> None:  # type: ignore[no-untyped-def]
@@ -182,14 +176,6 @@ def test_every_point_of_a_ray_projects_to_its_pixel_at_its_depth(
     p_camera = transform(invert_pose(T_world_camera), p_world)
     np.testing.assert_allclose(p_camera[:, 2], z, rtol=1e-9)
     np.testing.assert_allclose(project(p_camera, camera), pixels, atol=1e-6)
-
-
-@pytest.mark.parametrize("far_m", [1.1e5, -1e9, 1e300])
-def test_a_position_that_float32_cannot_resolve_is_refused(far_m: float) -> None:
-    pose = np.eye(4)
-    pose[1, 3] = far_m
-    with pytest.raises(PoseError, match="nearer origin"):
-        check_pose(pose, "frame 1")
 
 
 # Choosing views

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import semantic_mapper
 
 LOAD = """
@@ -25,31 +27,33 @@ log.bind(node="x").warning("bound")
 """
 
 
-def run(code: str) -> subprocess.CompletedProcess[str]:
+@pytest.mark.parametrize(
+    ("setup", "stdout", "stderr", "never"),
+    [
+        ("", "", ["disk_full", "free_mb=3", "50 % of it", "ZeroDivisionError", "bound"], "quiet"),
+        (
+            "logging.basicConfig(level=logging.DEBUG, format='%(name)s %(levelname)s %(message)s')",
+            "",
+            ["semantic_mapper.some.module INFO quiet", "semantic_mapper.some.module WARNING disk_full"],
+            "\0",
+        ),
+        (
+            "structlog.configure(processors=[structlog.processors.JSONRenderer()])",
+            '{"free_mb": 3, "path": "50 % of it", "event": "disk_full"}',
+            [],
+            "disk_full",
+        ),
+    ],
+    ids=["nothing set up", "logging set up", "structlog set up"],
+)
+def test_events_go_where_the_program_says_and_else_warnings_to_stderr(
+    setup: str, stdout: str, stderr: list[str], never: str
+) -> None:
+    code = f"{LOAD}{setup}\n{EVENTS}assert structlog.is_configured() == {setup.startswith('structlog')}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-    return done
-
-
-def test_where_nothing_is_set_up_warnings_go_to_stderr_and_nothing_to_stdout() -> None:
-    done = run(LOAD + EVENTS + "assert not structlog.is_configured()")
-    assert done.stdout == ""
-    assert "disk_full" in done.stderr and "free_mb=3" in done.stderr and "50 % of it" in done.stderr
-    assert "ZeroDivisionError" in done.stderr and "bound" in done.stderr and "quiet" not in done.stderr
-
-
-def test_logging_that_is_set_up_gets_all_levels_by_module() -> None:
-    setup = "logging.basicConfig(level=logging.DEBUG, format='%(name)s %(levelname)s %(message)s')\n"
-    done = run(LOAD + setup + EVENTS)
-    assert done.stdout == ""
-    assert "semantic_mapper.some.module INFO quiet" in done.stderr
-    assert "semantic_mapper.some.module WARNING disk_full" in done.stderr
-
-
-def test_structlog_that_the_program_sets_up_later_is_used_as_it_is() -> None:
-    setup = "structlog.configure(processors=[structlog.processors.JSONRenderer()])\n"
-    done = run(LOAD + setup + EVENTS)
-    assert '{"free_mb": 3, "path": "50 % of it", "event": "disk_full"}' in done.stdout and done.stderr == ""
+    assert stdout in done.stdout and bool(stdout) == bool(done.stdout)
+    assert all(part in done.stderr for part in stderr) and never not in done.stderr
 
 
 def test_no_library_module_logs_past_log_events() -> None:

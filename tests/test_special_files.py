@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper import VoxelMap, load_weights, open_log
-from semantic_mapper.errors import LogError, MapError, SemanticMapperError, WeightsError
+from semantic_mapper.errors import LogError, MapError, WeightsError
 
 
 @pytest.mark.timeout(20)
@@ -23,8 +23,3 @@ def test_special_file_is_refused_by_its_kind(tmp_path: Path, name: str) -> None:
         VoxelMap.load(path)
     with pytest.raises(WeightsError, match="no regular file"):
         load_weights(path)
-
-
-def test_folder_in_place_of_a_map_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SemanticMapperError):
-        VoxelMap.load(tmp_path)

@@ -1,7 +1,7 @@
 """Write the golden data of the contract tests from the code as it is.
 
     OMP_NUM_THREADS=1 python -m tests.contract.record             # all
-    OMP_NUM_THREADS=1 python -m tests.contract.record map cli     # some groups
+    OMP_NUM_THREADS=1 python -m tests.contract.record map wire     # some groups
 
 Golden data says what users have. Record again only what was meant to change, look at `git diff` of the JSON files, and
 say in the commit why users can live with it. Maps and other binary files stay: delete one by hand to make it again.
@@ -12,6 +12,7 @@ are kept.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import shutil
 import tempfile
@@ -111,10 +112,8 @@ def record_kitchen(folder: Path) -> None:
     golden.write("kitchen", {"numbers": runs.numbers_of(run), "weights": weights})
 
 
-def record_files(folder: Path) -> None:
-    """Files of today; those that are there stay."""
-    from tests.contract import test_files
-
+def make_files(folder: Path) -> None:
+    """Maps of today; those that are there stay."""
     if not MAP.exists():
         replays = LogReplays(FOLDER, lambda name: folder / name)
         made = replays(LOG, weights=WEIGHTS, config=golden.STORED_SETTINGS, max_frames=golden.STORED_FRAMES)
@@ -126,74 +125,28 @@ def record_files(folder: Path) -> None:
         ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
         assert ran.code == 0, ran.stderr
         shutil.copyfile(out / "map.npz", MAP_COARSE)
-    golden.write("files", test_files.observe(folder))
 
 
-def record_weights(folder: Path) -> None:
-    """What fields of every kind make of the golden log."""
-    from tests.contract import test_weights
-
-    golden.write("weights", test_weights.observe(folder))
-
-
-def record_answers(folder: Path) -> None:
-    """Answers to all questions about the golden map."""
-    from tests.contract import test_answers
-
-    golden.write("answers", test_answers.observe(folder))
-
-
-def record_log(folder: Path) -> None:
-    """What the golden log says."""
-    from tests.contract import test_log
-
-    golden.write("log", test_log.observe())
-
-
-def record_exporters(folder: Path) -> None:
-    """Structure and numbers of exported files."""
-    from tests.contract import test_exporters
-
-    golden.write("exporters", test_exporters.observe(folder))
-
-
-def record_cli(folder: Path) -> None:
-    """Verbs, options and exit codes."""
-    from tests.contract import test_command_line
-
-    golden.write("command_line", test_command_line.observe(folder))
-
-
-def record_python(folder: Path) -> None:
-    """Names that programs import, and their arguments."""
-    from tests.contract import test_python
-
-    golden.write("python", test_python.observe())
-
-
-GROUPS: dict[str, Callable[[Path], None]] = {
-    "wire": record_wire,
-    "map": record_map,
-    "kitchen": record_kitchen,
-    "files": record_files,
-    "log": record_log,
-    "weights": record_weights,
-    "answers": record_answers,
-    "exporters": record_exporters,
-    "cli": record_cli,
-    "python": record_python,
-}
+# Modules whose ``observe`` says what is held.
+OBSERVED = ("files", "log", "weights", "answers", "exporters", "command_line", "python")
+MADE: dict[str, Callable[[Path], None]] = {"wire": record_wire, "map": record_map, "kitchen": record_kitchen}
+GROUPS = (*MADE, *OBSERVED)
 
 
 def main() -> None:
     """Record."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("group", nargs="*", choices=[*GROUPS, []], help="by default all")
-    wanted = parser.parse_args().group or list(GROUPS)
+    wanted = parser.parse_args().group or GROUPS
     STORED.mkdir(parents=True, exist_ok=True)
     for name in wanted:
         with tempfile.TemporaryDirectory(prefix="contract-") as folder, patch.dict(os.environ):
-            GROUPS[name](Path(folder))
+            if name in MADE:
+                MADE[name](Path(folder))
+                continue
+            if name == "files":
+                make_files(Path(folder))
+            golden.write(name, importlib.import_module(f"tests.contract.test_{name}").observe(Path(folder)))
         print(f"{name} recorded")  # noqa: T201 - a script
 
 

@@ -6,12 +6,11 @@ from tests.contract.golden import FOLDER, LOG, MAP, MAP_COARSE, POINTS, STORED, 
 from tests.contract.record import GROUPS
 
 MOST_BYTES = 1_500_000
-NAMES = {"cli": "command_line"}
 
 
 def test_every_group_is_recorded() -> None:
     for group in GROUPS:
-        assert group == "inputs" or (FOLDER / f"{NAMES.get(group, group)}.json").is_file()
+        assert (FOLDER / f"{group}.json").is_file()
     for path in (LOG, MAP, MAP_COARSE, POINTS, STORED / "summary.json", WEIGHTS):
         assert path.is_file()
 

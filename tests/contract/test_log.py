@@ -16,7 +16,7 @@ from tests.contract.golden import FRAMES, LOG, REFUSED_SEQ, WEIGHTS, differences
 CUT_BYTES = 20_000  # from the end: less than one frame
 
 
-def observe() -> dict[str, Any]:
+def observe(_: Path) -> dict[str, Any]:
     """What the log says, by our reader, and by MCAP's own."""
     with LogReader(LOG) as log:
         frames = [plain(frame) for frame in log]
@@ -35,8 +35,8 @@ def observe() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_a_golden_log_says_what_it_said() -> None:
-    then, now = read("log"), observe()
+def test_a_golden_log_says_what_it_said(tmp_path: Path) -> None:
+    then, now = read("log"), observe(tmp_path)
     assert lacking(then.pop("described_form"), now.pop("described_form")) == []
     assert differences(then, now) == []
     assert len(then["frames"]) == FRAMES

@@ -50,7 +50,7 @@ def importable(module: str, name: str) -> Any:
     return attrgetter(name)(importlib.import_module(module))
 
 
-def observe() -> dict[str, Any]:
+def observe(_: Path) -> dict[str, Any]:
     """Each name with what can be called: itself, and of a class the public methods and attributes."""
     return {f"{module}:{name}": calls(importable(module, name)) for module, name in sorted(imported() | set(NAMED))}
 

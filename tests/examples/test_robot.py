@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import re
@@ -15,9 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.config import load_config
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.launcher.launch_file import LaunchFile
 from tests.nodes.support import TIMEOUT_S, eventually, repeated_frames, write_log
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -83,26 +80,3 @@ def test_it_follows_a_running_mapper_and_asks_it(environment: dict[str, str], tm
     assert numbers == sorted(set(numbers)) and numbers[-1] < FRAMES
     assert int(seen[-1][1]) == VoxelMap.load(tmp_path / "out" / "map.npz").block_count
     assert seen[-1][2] is not None and 0 < float(seen[-1][2]) < 5
-
-
-def test_it_reaches_the_mapper_of_a_launch_where_its_file_says(
-    environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(ROBOT))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", environment["XDG_RUNTIME_DIR"])
-    robot = importlib.import_module("robot")
-    asked: list[tuple[object, ...]] = []
-    monkeypatch.setattr(robot, "sightings", lambda *given: asked.append(given) or iter(()))
-    (mapper,) = (
-        node for node in load_config(ROOT / "launch" / "onboard.toml", LaunchFile).node if node.kind == "mapper"
-    )
-    places = mapper.options
-    flags = ["--updates", places["publish"], "--questions", places["query"]]
-    for given in ([], flags):
-        monkeypatch.setattr(sys, "argv", ["robot.py", "chair", "0", "0", "1", *given])
-        robot.main()
-    by_hand = f"ipc://{environment['XDG_RUNTIME_DIR']}/semantic-mapper/default/mapper"
-    assert [where for *_, where, _ in asked] == [by_hand, places["publish"]]
-    assert [where for *_, where in asked] == [None, places["query"]]
-    readme = (ROBOT / "README.md").read_text(encoding="utf-8")
-    assert " ".join(flags) in readme and len(readme.splitlines()) == 10

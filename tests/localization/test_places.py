@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_settings
 
-from semantic_mapper.config import KeyframeConfig, MapperConfig
+from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.localization.features import (
@@ -19,7 +19,6 @@ from semantic_mapper.localization.features import (
 )
 from semantic_mapper.localization.places import Place, PlaceStore, rank_places
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.drawn_room import walk_frames
@@ -80,12 +79,6 @@ def test_a_map_keeps_its_places_in_its_file(tmp_path: Path) -> None:
     for a, b in zip(voxel_map.places.places, again, strict=True):
         assert (a.camera_id, a.stamp_ns) == (b.camera_id, b.stamp_ns)
         assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("T_world_camera", "points", "descriptors"))
-
-
-def test_a_map_may_keep_nothing_to_be_found_by(tmp_path: Path) -> None:
-    mapped(MapperConfig(keyframes=KeyframeConfig(save_places=False))).save(tmp_path / "map.npz")
-    assert describe_map(tmp_path / "map.npz").places is None
-    assert len(VoxelMap.load(tmp_path / "map.npz").places) == 0
 
 
 def test_places_that_are_no_poses_are_refused(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping import changes as changes_module
 from semantic_mapper.mapping.blocks import BlockValues, pack_blocks
-from semantic_mapper.mapping.changes import BlockChanges, oldest_first
+from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import decided, random_grid
 from tests.mapping.rendered_views import small_map
@@ -43,21 +43,6 @@ def test_asking_on_leads_to_the_present_map(limit: int) -> None:
     walk(voxel_map, 5)
     assert collect(voxel_map, limit, grow=4) == contents(voxel_map.changes(0))
     assert voxel_map.frames == 9
-
-
-def test_whole_versions_the_oldest_first_and_at_least_one() -> None:
-    versions = np.array([3, 1, 3, 2, 7, 3, 1])
-    for limit, rows, version in (
-        (1, [1, 6], 1),
-        (2, [1, 6], 1),
-        (3, [1, 3, 6], 2),
-        (5, [1, 3, 6], 2),
-        (6, [0, 1, 2, 3, 5, 6], 3),
-        (7, list(range(7)), 9),
-        (0, list(range(7)), 9),
-    ):
-        chosen, complete = oldest_first(versions, limit, 9)
-        assert (chosen.tolist(), complete) == (rows, version), limit
 
 
 @pytest.mark.slow

@@ -81,21 +81,6 @@ def test_unchanged_poses_give_the_same_map_to_the_bit_also_where_frames_have_lef
     assert same(pipeline.voxel_map, without.voxel_map)
 
 
-def test_a_saved_map_that_was_gone_on_in_stays_where_it_is_through_a_correction():
-    frames = tiny_frames(6)
-    saved, again = mapped(frames[:3], max_frames=0).voxel_map, mapped(frames[:3], max_frames=0).voxel_map
-    pipeline, other = make_pipeline(), make_pipeline(0)
-    pipeline.voxel_map.take_over(saved)
-    other.voxel_map.take_over(again)
-    for frame in frames[3:]:
-        pipeline.step(frame)
-        other.step(frame)
-    pipeline.corrector.start({frames[4].stamp_ns: frames[4].T_world_camera})
-    finish(pipeline)
-    assert pipeline.corrector.status.completed == 1 and pipeline.voxel_map.frames == 6
-    assert same(pipeline.voxel_map, other.voxel_map)
-
-
 def test_frames_move_with_given_poses_of_their_own_world_alone():
     frames = [replace(f, world=int(i > 2)) for i, f in enumerate(tiny_frames(6))]
     pipeline = mapped(frames)
@@ -216,15 +201,6 @@ def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
     new = look()
     points, casts = {old[0], new[0]}, {old[1], new[1]}
     assert len(points) == 2 and {p for p, _ in seen} <= points and {c for _, c in seen} <= casts
-    pipeline.corrector.start({f.stamp_ns: f.T_world_camera for f in late})
-    rebuild = threading.Thread(target=finish, args=(pipeline,))
-    rebuild.start()
-    more = tiny_frames(9)[6:]
-    for frame in more:
-        pipeline.step(frame)
-    rebuild.join()
-    finish(pipeline)
-    assert pipeline.voxel_map.frames == 9 and pipeline.corrector.status.completed == 2
 
 
 def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():

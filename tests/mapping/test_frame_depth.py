@@ -102,27 +102,6 @@ def test_computed_depth_is_shown_to_an_encoder_that_has_learned_from_it_and_to_n
     assert not torch.equal(computed, features(replace(frame, depth_m=None) if learned else frame))
 
 
-def test_computed_depth_adds_to_a_measured_map_and_leaves_it_as_it_is() -> None:
-    half = len(walk()) // 2
-    pipeline = mapped(walk()[:half])
-    before = pipeline.voxel_map.block_state()
-    for frame in without_depth(walk()[half:]):
-        pipeline.step(frame)
-    after = pipeline.voxel_map.block_state()
-    rows = {tuple(key): row for row, key in enumerate(after["keys"].tolist())}
-    here = [rows[tuple(key)] for key in before["keys"].tolist()]
-    measured = before["weight"] >= MEASURED
-    assert measured.sum() > 10_000
-    for name in ("tsdf", "weight", "color"):
-        assert after[name][here][measured].tobytes() == before[name][measured].tobytes(), name
-    new = (after["weight"] > 0) & (after["weight"] < MEASURED)
-    assert new.any(), "what the first half has not seen is computed"
-    said = pipeline.voxel_map.points().measured
-    assert said is not None and 0.1 < said.mean() < 1
-    view = pipeline.voxel_map.ray_cast(walk()[0].T_world_camera, CAMERA)
-    assert view.measured is not None and view.measured[view.depth_m > 0].mean() > 0.9
-
-
 @pytest.mark.parametrize(("source", "computed"), [("auto", False), ("computed", True)])
 def test_depth_of_a_sensor_is_used_unless_the_pictures_are_asked_for(source: str, computed: bool) -> None:
     pipeline = make_pipeline(depth={"source": source})

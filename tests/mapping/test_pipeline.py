@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import GridFieldConfig
-from semantic_mapper.errors import FrameError, PoseError, WeightsError
+from semantic_mapper.errors import PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.streaming import StreamingSRay
@@ -39,32 +39,6 @@ def test_depth_that_no_sensor_measures_counts_as_none(value: float):
         hostile.step(replace(frame, depth_m=wild))
         blank.step(replace(frame, depth_m=none))
     assert same_map(hostile, blank)
-
-
-def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
-    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
-):
-    monkeypatch.setattr("semantic_mapper.mapping.allocation.LEAST_FRAME_BUDGET", 400)
-    a, b = (make_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
-    good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
-    noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))
-    a.step(good)
-    with pytest.raises(FrameError, match=r"more than 400 blocks of 0\.02 m voxels"):
-        a.step(noise)
-    a.step(replace(good, seq=2))
-    b.step(good)
-    b.step(replace(good, seq=2))
-    assert same_map(a, b)
-
-
-def test_a_map_takes_frames_of_so_many_cameras_and_no_more(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("semantic_mapper.mapping.pipeline.MAX_CAMERAS", 2)
-    pipeline, frame = make_pipeline(), tiny_frames()[0]
-    for name in ("left", "right", "left"):
-        pipeline.step(replace(frame, camera_id=name))
-    with pytest.raises(FrameError, match="takes 2 cameras"):
-        pipeline.step(replace(frame, camera_id="third"))
-    pipeline.step(replace(frame, camera_id="right"))
 
 
 def test_bad_frames_are_refused_and_leave_the_map_as_it_was():

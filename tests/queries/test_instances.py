@@ -66,10 +66,6 @@ def test_table_and_cup_are_found_where_they_stand() -> None:
     assert np.abs(cup.voxels * 0.02 - BALL).max() < 0.26
 
 
-def test_small_pieces_are_left_out() -> None:
-    assert InstanceTracker(min_voxels=10**6).update(whole()) == ()
-
-
 def test_ids_stay_while_the_map_grows() -> None:
     voxel_map, mirror = small_map(LABELS), MapMirror(0.02, 4.0, LABELS)
     tracker = InstanceTracker(min_voxels=100)

@@ -11,10 +11,9 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box
-from tests.mapping.rendered_views import small_map
-from tests.queries.scene import LABELS, integrate, poses, whole
+from tests.queries.scene import whole
 
 LOW, HIGH = (-1, -1, -1), (1, 1, 1)
 WITH_METRES: dict[str, Callable[[MapSnapshot], object]] = {
@@ -33,16 +32,3 @@ def test_metres_are_refused(name: str) -> None:
     WITH_METRES[name](whole())
     with pytest.raises(MapError, match=r"the scale is unknown; give a scale.*--distance"):
         WITH_METRES[name](dataclasses.replace(whole(), scale_known=False))
-
-
-def test_mirrors_of_mirrors_follow_it() -> None:
-    voxel_map = small_map(LABELS)
-    voxel_map.note_scale(False)
-    integrate(voxel_map, poses(1)[0], 0)
-    direct = MapMirror.of(voxel_map)
-    copied = MapMirror(0.02, 4.0, LABELS)
-    copied.apply(voxel_map.copy_changes(0).compact())
-    second = MapMirror(0.02, 4.0, LABELS)
-    second.apply(direct.snapshot().changes(0))
-    assert not any(mirror.snapshot().scale_known for mirror in (direct, copied, second))
-    assert whole().scale_known

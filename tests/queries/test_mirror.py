@@ -16,7 +16,6 @@ from semantic_mapper.queries import snapshot as mirror_module
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from tests.mapping.rendered_views import small_map
-from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses
 
 
@@ -48,44 +47,6 @@ def test_fed_in_parts_while_the_map_grows_it_is_the_map(monkeypatch: pytest.Monk
     assert len(pools) > 1
     assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
     assert mirror.snapshot().block_count == voxel_map.block_count
-
-
-def test_a_map_that_was_replaced_by_a_corrected_one_leaves_nothing_of_the_old_one() -> None:
-    voxel_map, corrected, mirror = small_map(LABELS), small_map(LABELS), empty_mirror()
-    for seq, pose in enumerate(poses(4)):
-        integrate(voxel_map, pose, seq)
-        shifted = pose.copy()
-        shifted[:3, 3] += 0.5
-        integrate(corrected, shifted, seq)
-    mirror.apply(voxel_map.changes(0))
-    old = mirror.snapshot()
-    voxel_map.take_over(corrected)
-    integrate(voxel_map, poses(1)[0], 8)  # blocks that it touches come last
-    parts = 0
-    while mirror.version < voxel_map.version:
-        assert mirror.snapshot() is old and mirror.is_whole == (parts == 0)
-        mirror.apply(voxel_map.changes(mirror.version, limit=10))
-        parts += 1
-    assert parts > 1 and mirror.is_whole
-    assert mirror.snapshot().epoch == voxel_map.epoch == 1
-    assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
-    integrate(voxel_map, poses(1)[0], 9)
-    mirror.apply(voxel_map.changes(mirror.version))
-    assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
-
-
-def test_a_paged_map_has_the_same_mirror() -> None:
-    free, paged = small_map(voxel_size_m=0.01), small_map(voxel_size_m=0.01, memory_mb=MEMORY_MB)
-    mirror = MapMirror(0.01, 4.0, paged.label_set)
-    for n in range(8):
-        for voxel_map in (free, paged):
-            walk(voxel_map, 1, first=n)
-        mirror.apply(paged.changes(mirror.version, limit=300))
-    while mirror.version < paged.frames:
-        mirror.apply(paged.changes(mirror.version, limit=300))
-    assert paged.stored_blocks > 100
-    assert_same(mirror.snapshot(), MapMirror.of(free).snapshot())
-    assert_same(MapMirror.of(paged).snapshot(), MapMirror.of(free).snapshot())
 
 
 def test_a_snapshot_stays_as_it_was() -> None:
@@ -141,3 +102,53 @@ def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> No
     assert [getattr(a, name) for name in names] == [getattr(b, name) for name in names]
     np.testing.assert_array_equal(a.versions, b.versions)
     assert loaded.is_whole
+
+
+def follow(mirror: MapMirror, source: MapMirror, limit: int) -> int:
+    """Apply all that the source has, in parts; how many parts that took."""
+    parts = 0
+    while mirror.version < source.snapshot().version:
+        mirror.apply(source.snapshot().changes(mirror.version, limit))
+        parts += 1
+    return parts
+
+
+def test_after_a_new_epoch_nothing_of_the_old_one_is_left() -> None:
+    voxel_map, corrected = small_map(LABELS), small_map(LABELS)
+    source, early, late = empty_mirror(), empty_mirror(), empty_mirror()
+    for seq, pose in enumerate(poses(4)):
+        integrate(voxel_map, pose, seq)
+        shifted = pose.copy()
+        shifted[:3, 3] += 0.5
+        integrate(corrected, shifted, seq)
+    source.apply(voxel_map.changes(0))
+    follow(early, source, 0)
+    voxel_map.take_over(corrected)
+    integrate(voxel_map, poses(1)[0], 9)
+    first = voxel_map.changes(source.version, limit=10)
+    assert source.apply(first).epoch == source.snapshot().changes(0).epoch == 0 and first.version < voxel_map.version
+    while source.version < voxel_map.version:
+        source.apply(voxel_map.changes(source.version, limit=10))
+    assert source.snapshot().epoch == 1
+    most = max(len(source.snapshot().changes(v, 10).keys) for v in range(4, source.snapshot().version))
+    assert most < source.snapshot().block_count and follow(early, source, 10) > 1
+    integrate(voxel_map, poses(2)[1], 10)
+    source.apply(voxel_map.changes(source.snapshot().version))
+    assert follow(early, source, 10) == 1
+    follow(late, source, 10)
+    whole = MapMirror.of(voxel_map).snapshot()
+    for mirror in (source, early, late):
+        assert mirror.snapshot().epoch == 1
+        assert_same(mirror.snapshot(), whole)
+
+
+def test_only_what_changed_is_passed_on() -> None:
+    source = empty_mirror()
+    source.apply(painted(np.full((16, 16), TABLE, np.uint8), 0, 3))
+    source.apply(painted(np.full((8, 16), FLOOR, np.uint8), 3, 5))
+    assert [len(source.snapshot().changes(since).keys) for since in (0, 2, 3, 4, 5)] == [4, 4, 2, 2, 0]
+    first = source.snapshot().changes(0, limit=1)
+    assert (first.since, first.version, len(first.keys)) == (0, 3, 2)
+    for since, limit in ((-1, 0), (6, 0), (0, -1)):
+        with pytest.raises(MapError, match="go from 0 to 5"):
+            source.snapshot().changes(since, limit)
