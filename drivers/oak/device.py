@@ -215,14 +215,8 @@ def to_ns(moment: timedelta) -> int:
 
 def clock_offset_ns() -> int:
     """What to add to a time of DepthAI's host clock to have one of this machine's monotonic clock."""
-    dai = load_depthai()
-    readings: list[tuple[int, int]] = []
-    for _ in range(_CLOCK_READINGS):
-        before = time.monotonic_ns()
-        theirs = to_ns(dai.Clock.now())
-        after = time.monotonic_ns()
-        readings.append((after - before, (before + after) // 2 - theirs))
-    return min(readings)[1]
+    clock = load_depthai().Clock
+    return max(time.monotonic_ns() - to_ns(clock.now()) for _ in range(_CLOCK_READINGS))
 
 
 def capture_ns(frame: Any, offset_ns: int) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.poses.config import BoardPoses, matrix
+from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose, rotation_vector
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
@@ -116,7 +116,7 @@ class BoardPoseSource(PoseSource):
         super().__init__()
         self._finder = BoardFinder(config)
         self._min_corners = min(MIN_CORNERS, 4 * config.columns * config.rows)
-        self._T_world_board = matrix(config.T_world_board)
+        self._T_world_board = np.array(config.T_world_board)
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """Pose of a rectified image; None where the board is not seen well enough, see ``counters``."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from semantic_mapper.config import AtLeastOne, Config, Positive
 from semantic_mapper.drivers.calibration import Matrix, load_mount, rigid_matrix
@@ -22,11 +21,6 @@ WAYS_OUT = (
     '"board"), a place where it stands still (kind = "fixed"), its own pictures (kind = '
     '"visual"), or use a camera with depth (kind = "rgbd") or one that tracks itself (kind = "device")'
 )
-
-
-def matrix(rows: Matrix) -> Float64:
-    """Rows -> (4, 4)."""
-    return np.array(rows, np.float64)
 
 
 class DevicePoses(Config, frozen=True):
@@ -147,8 +141,7 @@ def can_be_found(config: PoseConfig) -> bool:
 
 def poses_of_rig(config: PoseConfig) -> bool:
     """Whether poses are of a rig, on which the camera sits somewhere, rather than of the camera itself."""
-    rig = config.T_world_rig if isinstance(config, FixedPose) else None
-    return (config.T_base_rig if isinstance(config, TopicPoses) else rig) is not None
+    return (getattr(config, "T_world_rig", None) or getattr(config, "T_base_rig", None)) is not None
 
 
 def mount_for(
@@ -156,13 +149,8 @@ def mount_for(
 ) -> Float64 | None:
     """T_rig_camera (4, 4) where poses are those of a rig; None where they are the camera's own.
 
-    Args:
-        poses: Settings of their source.
-        rows: T_rig_camera of the camera's settings.
-        kind: Of the camera; ``config``: its driver's settings, which may name a calibration file.
-        camera: For messages.
-
-    ``ConfigError``: it is needed and not known, requested and without effect, or no rigid transform.
+    It is that of the camera's settings (``rows``), else of the calibration file that ``config``, its driver's settings,
+    may name. Raises ConfigError: it is needed and not known, requested and without effect, or no rigid transform.
     """
     if not poses_of_rig(poses):
         if rows is None:

@@ -18,10 +18,12 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from scipy.cluster.hierarchy import DisjointSet
 
 from semantic_mapper.bundle.keyframes import minimize
 from semantic_mapper.drivers.base import CorrectedWorld
-from semantic_mapper.geometry import interpolate_pose, invert_pose, pose_distance
+from semantic_mapper.drivers.poses.motion import apart
+from semantic_mapper.geometry import interpolate_pose, invert_pose
 from semantic_mapper.localization.depth_alignment import FALSE, POINTS_A_VOTE, Fit, Target, align, fit
 from semantic_mapper.localization.features import Features, pose_from_features
 from semantic_mapper.localization.places import most_crowded, rank_places, view_distances
@@ -61,12 +63,6 @@ _LEFT_M = 0.002
 _log = get_logger(__name__)
 
 
-def apart(T_a: Float64, T_b: Float64) -> tuple[float, float]:
-    """Metres and degrees between two poses."""
-    moved_m, turned = pose_distance(T_a, T_b)
-    return moved_m, float(np.rad2deg(turned))
-
-
 def within(T_a: Float64, T_b: Float64, limits: tuple[float, float]) -> bool:
     """Whether two poses are apart by less than so many metres and degrees."""
     moved_m, turned_deg = apart(T_a, T_b)
@@ -94,17 +90,11 @@ class OdometryKeyframe:
 class Edge:
     """A measured motion from one keyframe to another."""
 
-    # a, b: Keyframes by number.
-    a: int
+    a: int  # keyframe by number
     b: int
     T_a_b: Float64  # (4, 4)
     covariance: Float64  # (6, 6) of rotation and position, in the axes of b
     chain: bool = False  # between keyframes that tracking has linked, and measured well: no loop may bend it
-
-    @property
-    def strength(self) -> tuple[bool, float]:
-        """Greater is better."""
-        return self.chain, -float(np.trace(self.covariance[3:, 3:]))
 
 
 @dataclass(slots=True, eq=False)
@@ -156,7 +146,7 @@ class KeyframeGraph:
 
     def linked(self, number: int) -> set[int]:
         """Keyframes that have an edge to this one."""
-        return {e.b if e.a == number else e.a for e in self.edges if number in (e.a, e.b)}
+        return {k for e in self.edges if number in (e.a, e.b) for k in (e.a, e.b)}
 
     def way(self, a: int, b: int) -> tuple[float, float]:
         """Metres along the shortest chain of edges (Dijkstra), and one sigma of all of these together."""
@@ -201,19 +191,11 @@ class KeyframeGraph:
 
     def _strongest(self, edges: list[Edge]) -> list[Edge]:
         """The strongest edges, so that the graph's size has a bound, with those that keep it in one piece (Kruskal)."""
-        parent = {number: number for number in self.frames}
-
-        def root(number: int) -> int:
-            while parent[number] != number:
-                number = parent[number]
-            return number
-
+        joined = DisjointSet(self.frames)
         tree: list[Edge] = []
         others: list[Edge] = []
-        for edge in sorted(edges, key=lambda e: e.strength, reverse=True):
-            a, b = root(edge.a), root(edge.b)
-            parent[b] = a
-            (others if a == b else tree).append(edge)
+        for edge in sorted(edges, key=lambda e: (e.chain, -np.trace(e.covariance[3:, 3:])), reverse=True):
+            (tree if joined.merge(edge.a, edge.b) else others).append(edge)
         return tree + others[: _MOST_EDGES * len(self.frames) - len(tree)]
 
     def optimized(self) -> dict[int, Float64]:
@@ -283,7 +265,7 @@ class LoopCloser:
         near = self._near(keyframe)
         self._jobs.extend((k, number, invert_pose(poses[k]) @ poses[number]) for k in near if k != parent)
         if not self._looking[1]:  # else this keyframe is not looked for: the search has to keep up
-            known = {number, *near} | self._graph.linked(number)
+            known = {number, *near, *self._graph.linked(number)}
             self._looking = number, [k for k in self._graph.frames if k not in known]
 
     def work(self, optimize: bool) -> Mapping[int, Float64] | None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from semantic_mapper.geometry import interpolate_pose
+from semantic_mapper.geometry import interpolate_pose, pose_distance
 from semantic_mapper.types import Float64
 
 _BASELINE_NS = 20_000_000  # velocities are those over at least so long, where there are such poses
@@ -26,13 +26,17 @@ class StampedPose:
     sigma: float = 0.0
 
 
+def apart(T_a: Float64, T_b: Float64) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    moved_m, turned = pose_distance(T_a, T_b)
+    return moved_m, float(np.rad2deg(turned))
+
+
 class PoseTrack:
     """The last ``keep`` poses of something that moves, at any time in between. Not for several threads at once.
 
-    Args:
-        keep: Samples kept.
-        max_gap_ns: Between two samples further apart than this nothing is interpolated.
-        max_ahead_ns: How far beyond the last sample its motion is taken to go on.
+    Nothing is interpolated between two samples further apart than ``max_gap_ns``; the motion of the last one is taken
+    to go on for ``max_ahead_ns``.
     """
 
     def __init__(self, keep: int, max_gap_ns: int, max_ahead_ns: int) -> None:

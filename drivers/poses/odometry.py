@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage, CorrectedWorld, PoseEstimate, PoseSource
-from semantic_mapper.drivers.poses.config import WAYS_OUT, OdometryPoses, can_be_found, matrix
+from semantic_mapper.drivers.poses.config import WAYS_OUT, OdometryPoses, can_be_found
 from semantic_mapper.drivers.poses.loop_closure import (
     DRIFT,
     MIN_MATCHES,
@@ -29,11 +29,10 @@ from semantic_mapper.drivers.poses.loop_closure import (
     KeyframeGraph,
     LoopCloser,
     OdometryKeyframe,
-    apart,
     lies_on,
     within,
 )
-from semantic_mapper.drivers.poses.motion import StampedPose
+from semantic_mapper.drivers.poses.motion import StampedPose, apart
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import interpolate_pose, invert_pose, make_pose, rotation_vector
 from semantic_mapper.localization.depth_alignment import (
@@ -234,7 +233,7 @@ class OdometryPoseSource(PoseSource):
         return _View(image.stamp_ns, rgb, depth, intrinsics, make_levels(depth, intrinsics))
 
     def _begin(self, view: _View) -> PoseEstimate:
-        pose = matrix(self._config.T_world_start)
+        pose = np.array(self._config.T_world_start)
         self._add_keyframe(view, pose, 0.0, None)
         return self._given(view, pose, 0.0)
 
@@ -271,11 +270,8 @@ class OdometryPoseSource(PoseSource):
 
     def _guesses_of_features(self, view: _View, keyframes: list[OdometryKeyframe]) -> list[Float64]:
         """Those with the most corners in agreement first."""
-        found: list[tuple[int, Float64]] = []
-        for keyframe in keyframes:
-            match = pose_from_features(view.features, keyframe.features, view.intrinsics, MIN_MATCHES)
-            if match is not None:
-                found.append((match[1], keyframe.target.T_world_camera @ match[0]))
+        matches = [(k, pose_from_features(view.features, k.features, view.intrinsics, MIN_MATCHES)) for k in keyframes]
+        found = [(match[1], k.target.T_world_camera @ match[0]) for k, match in matches if match is not None]
         return [pose for _, pose in sorted(found, key=lambda item: -item[0])]
 
     def _try(self, view: _View, guess: Float64) -> _Found | None:

@@ -13,15 +13,14 @@ import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage, CorrectedWorld, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import PoseChecks
-from semantic_mapper.drivers.poses.motion import StampedPose
+from semantic_mapper.drivers.poses.motion import StampedPose, apart
 from semantic_mapper.errors import PoseError, ShapeError
-from semantic_mapper.geometry import check_pose, pose_distance
+from semantic_mapper.geometry import check_pose
 from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
-EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is believed at once
 REASONS = ("no_pose", "stale", "not_rotation", "outliers", "uninitialized")
 MAX_TURN_DEG_S = 360.0  # faster than this between two images is a jump
 SLACK_M, SLACK_DEG = 0.05, 3.0  # a pose may be off by so much at any rate
@@ -39,14 +38,8 @@ class PosedCamera:
     """The images of a camera, each with its pose.
 
     An image that gets none is left out, which shows as a gap in ``seq``. A camera's first frames are held back until
-    some of their poses agree with each other, and are given then.
-
-    Args:
-        camera: Gives the images.
-        poses: Gives their poses.
-        checks: What to refuse.
-        T_rig_camera: (4, 4) where the poses are those of a rig, and the camera sits there.
-        scale_known: Whether poses are in metres.
+    some of their poses agree with each other, and are given then. ``T_rig_camera`` (4, 4): where the poses are those of
+    a rig, and the camera sits there. ``scale_known``: whether poses are in metres.
 
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
@@ -134,7 +127,8 @@ class PosedCamera:
                 if outlier_filter is not None:
                     why = "the camera began another world before its first poses were sure"
                     yield from self._passed(outlier_filter.give_up(why))
-                needed = 1 if estimate.source in EXACT else INIT_CONSENSUS
+                # A pose that comes from the settings is believed at once.
+                needed = 1 if estimate.source == "fixed" else INIT_CONSENSUS
                 outlier_filter = PoseOutlierFilter(self._checks.max_speed_m_s, needed)
                 self._filters[image.camera_id] = estimate.world, outlier_filter
             frame = PosedFrame(
@@ -209,11 +203,8 @@ class PoseOutlierFilter:
     continues from there must not pass because of that; one that jumps back may.
 
     Frames are refused as "outliers", which cannot have been reached from poses that are believed, or "uninitialized",
-    which did not agree with those after them while none was believed; "" = it passes.
-
-    Args:
-        max_speed_m_s: Of the camera.
-        needed: So many first poses in a row have to agree.
+    which did not agree with those after them while none was believed; "" = it passes. So many first poses in a row as
+    ``needed`` have to agree.
     """
 
     def __init__(self, max_speed_m_s: float, needed: int) -> None:
@@ -265,11 +256,11 @@ class PoseOutlierFilter:
         """Why a pose is refused; empty where it passes."""
         if self._elsewhere is not None and not self._jump(self._elsewhere, sample):
             self._elsewhere = sample
-            moved_m, turned_deg, seconds = _way(last, sample)
+            moved_m, turned_deg = apart(last.T, sample.T)
             return (
                 f"the poses have jumped and continue from there, now {moved_m:.2f} m and {turned_deg:.0f} degrees from "
-                f"the last one that was believed, {seconds:.1f} s ago; they are left out, since those of another world "
-                "would spoil the map; if they are right now, start the launch again"
+                f"the last one that was believed, {(sample.stamp_ns - last.stamp_ns) / 1e9:.1f} s ago; they are left "
+                "out, since those of another world would spoil the map; if they are right now, start the launch again"
             )
         why = self._jump(last, sample)
         if not why:
@@ -279,7 +270,7 @@ class PoseOutlierFilter:
 
     def _jump(self, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
         """Why b cannot have been reached from a, with this many times the limits; empty where it can."""
-        moved_m, turned_deg, seconds = _way(a, b)
+        (moved_m, turned_deg), seconds = apart(a.T, b.T), (b.stamp_ns - a.stamp_ns) / 1e9
         allowed_m = times * (SLACK_M + self._max_speed_m_s * seconds)
         allowed_deg = times * (SLACK_DEG + MAX_TURN_DEG_S * seconds)
         if moved_m <= allowed_m and turned_deg <= allowed_deg:
@@ -288,9 +279,3 @@ class PoseOutlierFilter:
             f"the pose jumps by {moved_m:.2f} m and {turned_deg:.0f} degrees in {seconds:.3f} s; at most "
             f"{allowed_m:.2f} m and {allowed_deg:.0f} degrees are believed (max_speed_m_s)"
         )
-
-
-def _way(a: StampedPose, b: StampedPose) -> tuple[float, float, float]:
-    """Metres, degrees and seconds from a to b."""
-    moved_m, turned = pose_distance(a.T, b.T)
-    return moved_m, float(np.rad2deg(turned)), (b.stamp_ns - a.stamp_ns) / 1e9

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from semantic_mapper.config import convert_config, nearest
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.calibration import rigid_matrix
@@ -19,7 +21,6 @@ from semantic_mapper.drivers.poses.config import (
     PoseConfig,
     TopicPoses,
     VisualPoses,
-    matrix,
 )
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
@@ -57,9 +58,8 @@ def make_poses(config: PoseConfig) -> PoseSource:
             return BoardPoseSource(config)
         case OdometryPoses():
             return OdometryPoseSource(config)
-        case VisualPoses():
-            scale = make_poses(read_pose_config(config.scale, "poses: scale")) if config.scale else None
-            return VisualPoseSource(config, scale)
+        case VisualPoses(scale=scale):
+            return VisualPoseSource(config, make_poses(read_pose_config(scale, "poses: scale")) if scale else None)
 
 
 class DevicePoseSource(PoseSource):
@@ -84,7 +84,7 @@ class FixedPoseSource(PoseSource):
 
     def __init__(self, config: FixedPose) -> None:
         super().__init__()
-        self._estimate = PoseEstimate(matrix(config.T_world_rig or config.T_world_camera), "fixed")
+        self._estimate = PoseEstimate(np.array(config.T_world_rig or config.T_world_camera), "fixed")
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
         """The pose."""

@@ -7,10 +7,11 @@ import time
 from pathlib import Path
 from typing import Self
 
+import numpy as np
 import zmq
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.poses.config import TopicPoses, matrix
+from semantic_mapper.drivers.poses.config import TopicPoses
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
 from semantic_mapper.log_events import get_logger, is_power_of_two
@@ -60,7 +61,7 @@ class TopicPoseSource(PoseSource):
             check_connect(config.endpoint, self._identity)
         except TransportError as error:  # now: a camera that cannot be opened is waited for
             raise CameraError(f"pose topic: {error}") from error
-        self._mount = matrix(config.T_base_rig or config.T_base_camera)
+        self._mount = np.array(config.T_base_rig or config.T_base_camera)
         self._track = PoseTrack(_KEPT, _MAX_GAP_NS, _MAX_AHEAD_NS)
         self._changed = threading.Condition()
         self._closed = threading.Event()

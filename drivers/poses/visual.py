@@ -19,7 +19,7 @@ from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.scale import ScaleEstimator, floor_height
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres, matrix
+from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres
 from semantic_mapper.geometry import camera_matrix, interpolate_pose, invert_pose, transform
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.localization.features import match_features, pose_from_points
@@ -150,7 +150,7 @@ class VisualPoseSource(PoseSource):
             if depth is None:
                 return pose
             self._metric = bool(self._config.distance_m)
-            start = matrix(self._config.T_world_start)
+            start = np.array(self._config.T_world_start)
             return self._begin_world(odometry, pose, (self._config.distance_m or 1.0) / depth, start)
         if reference is None:
             return pose
@@ -168,7 +168,7 @@ class VisualPoseSource(PoseSource):
         """The pose once the distance from the floor is brought to what the camera's height over it is."""
         if not odometry.keyframe_added:
             return pose
-        start = matrix(self._config.T_world_start)
+        start = np.array(self._config.T_world_start)
         if np.array_equal(start, np.eye(4)):
             start[:3, :3], start[2, 3] = _LEVEL, self._config.camera_height_m
         found = odometry.floor_below(np.array((0.0, 0.0, 1.0)) if self._world_begun else start[2, :3])

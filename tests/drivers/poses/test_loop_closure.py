@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.poses import loop_closure
-from semantic_mapper.drivers.poses.loop_closure import Edge, KeyframeGraph, LoopCloser, OdometryKeyframe, apart
+from semantic_mapper.drivers.poses.loop_closure import Edge, KeyframeGraph, LoopCloser, OdometryKeyframe
+from semantic_mapper.drivers.poses.motion import apart
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.localization.depth_alignment import Target, make_levels, thin_depth
 from semantic_mapper.localization.features import Features, find_place_features
