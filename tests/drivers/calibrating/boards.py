@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.calibrating.views import MIN_CORNERS, BoardView
 from semantic_mapper.drivers.poses.board import make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.geometry import camera_matrix, invert_pose, look_at
@@ -57,16 +58,9 @@ def image(seq: int, T_camera_board: Float64, lens: CameraIntrinsics = LENS, came
     return CameraImage((seq + 1) * 1_000_000_000, seq, camera_id, picture(T_camera_board, lens), None, plain)
 
 
-def views(count: int = 24, *, tilted: bool = True, aside: float = 1.0, seed: int = 3) -> list[Float64]:
-    """T_camera_board of a board that is shown all over the image.
-
-    Args:
-        count: How many.
-        tilted: Whether it leans.
-        aside: How far from the middle of the image it is shown; 0 = never.
-        seed: Of what is random about them.
-    """
-    rng = np.random.default_rng(seed)
+def views(count: int = 24, *, tilted: bool = True, aside: float = 1.0) -> list[Float64]:
+    """T_camera_board of a board that is shown all over the image, leaning or not; ``aside`` 0: in the middle alone."""
+    rng = np.random.default_rng(3)
     middle = np.array((BOARD.columns, BOARD.rows, 0.0)) * BOARD.square_m / 2
     found: list[Float64] = []
     for number in range(count):
@@ -86,9 +80,14 @@ def shown() -> tuple[tuple[Float64, CameraImage], ...]:
     return tuple((T, image(seq, T)) for seq, T in enumerate(views(20)))
 
 
-def corners_of(T_camera_board: Float64, lens: CameraIntrinsics, board: BoardPoses = BOARD) -> tuple[Float64, Float64]:
-    """All inner corners: on the board (N, 3), and where the lens shows them (N, 2)."""
-    points = np.asarray(make_board(board).getChessboardCorners(), np.float64).reshape(-1, 3)
+def made_up(T_camera_board: Float64, number: int, noise_px: float, rng: np.random.Generator) -> BoardView | None:
+    """What finding corners in a picture would give, without the picture; None where too few are in it."""
+    points = np.asarray(make_board(BOARD).getChessboardCorners(), np.float64).reshape(-1, 3)
     turn = cv2.Rodrigues(T_camera_board[:3, :3])[0]
-    seen, _ = cv2.projectPoints(points, turn, T_camera_board[:3, 3], camera_matrix(lens), np.array(lens.distortion))
-    return points, np.asarray(seen, np.float64).reshape(-1, 2)
+    seen, _ = cv2.projectPoints(points, turn, T_camera_board[:3, 3], camera_matrix(LENS), np.array(LENS.distortion))
+    pixels = np.asarray(seen, np.float64).reshape(-1, 2)
+    inside = ((pixels > 2) & (pixels < (LENS.width - 3, LENS.height - 3))).all(axis=1)
+    if inside.sum() < MIN_CORNERS:
+        return None
+    noise = rng.normal(0, noise_px, (int(inside.sum()), 2))
+    return BoardView(str(number), number, points[inside], pixels[inside] + noise)

@@ -11,7 +11,6 @@ from semantic_mapper.drivers.calibrating import rig
 from semantic_mapper.drivers.calibrating.rig import calibrate_rig, solve
 from semantic_mapper.drivers.calibrating.views import (
     MAX_VIEWS,
-    MIN_CORNERS,
     BoardView,
     CalibrationConfig,
     ViewGatherer,
@@ -22,7 +21,7 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64
 from tests.drivers.poses.images import rigid
 
-from .boards import BOARD, LENS, corners_of, image, shown, views
+from .boards import BOARD, LENS, image, made_up, shown, views
 
 CONFIG = CalibrationConfig()
 RIG = {
@@ -32,22 +31,12 @@ RIG = {
 }
 
 
-def seen(T_camera_board: Float64, stamp: int, noise_px: float, rng: np.random.Generator) -> BoardView | None:
-    points, pixels = corners_of(T_camera_board, LENS)
-    inside = ((pixels > 2) & (pixels < (LENS.width - 3, LENS.height - 3))).all(axis=1)
-    if inside.sum() < MIN_CORNERS:
-        return None
-    return BoardView(
-        str(stamp), stamp, points[inside], pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
-    )
-
-
 def shows(names: tuple[str, ...], count: int, noise_px: float = 0.15) -> list[dict[str, BoardView]]:
     """Boards before some cameras of the rig."""
     rng = np.random.default_rng(1)
     found = []
     for stamp, T_left_board in enumerate(views(count, aside=0.6)):
-        sights = {n: seen(invert_pose(RIG[n]) @ T_left_board, stamp, noise_px, rng) for n in names}
+        sights = {n: made_up(invert_pose(RIG[n]) @ T_left_board, stamp, noise_px, rng) for n in names}
         found.append({n: view for n, view in sights.items() if view is not None})
     return [group for group in found if len(group) > 1]
 
