@@ -43,12 +43,10 @@ def opencv(named: Path | str, tmp_path: Path, **settings: Any) -> Camera:
     return open_camera("opencv", config | settings, "film", "test")
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [(".avi", "MJPG"), (".mp4", "mp4v")])
-def test_every_image_of_a_file_comes_with_the_time_within_it(tmp_path: Path, suffix: str, codec: str) -> None:
-    path = red_film(tmp_path / f"red{suffix}", codec)
-    with opencv(path, tmp_path) as camera:
+def test_every_image_of_a_file_comes_with_the_time_within_it(tmp_path: Path) -> None:
+    with opencv(red_film(tmp_path / "red.mp4", "mp4v"), tmp_path) as camera:
         assert camera.info.frame_count == COUNT and camera.info.frame_hz == HZ
-        assert camera.info.source == f"video red{suffix}"
+        assert camera.info.source == "video red.mp4"
         images = list(camera)
         assert camera.warnings == ()
     assert [image.seq for image in images] == list(range(COUNT))
@@ -78,7 +76,7 @@ def test_a_file_in_its_recorded_rhythm_can_be_stopped(video: Path, tmp_path: Pat
         ({"source": "missing.avi"}, "missing.avi: no such video file"),
         ({"source": __file__}, "no video that OpenCV can read"),
         ({"calibration": "large.toml"}, "64x48, but was calibrated at 128x96"),
-        ({"sorce": "x"}, "did you mean `source`?"),
+        ({"source": "http://127.0.0.1:1/stream.mjpg", "open_timeout_s": 1}, "cannot be opened within 1 s"),
     ],
 )
 def test_what_cannot_be_played_is_told(
@@ -165,11 +163,6 @@ def test_a_stream_that_breaks_off_is_connected_anew(sender: Sender, tmp_path: Pa
         later = next(image for image in images if image.stamp_ns > back_ns)
         assert later.seq > first.seq + 1 and sender.connections >= 2
         assert camera.warnings == ()
-
-
-def test_nobody_at_an_address_is_told(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match="cannot be opened within 1 s"):
-        opencv("http://127.0.0.1:1/stream.mjpg", tmp_path, open_timeout_s=1).__enter__()
 
 
 def test_the_sender_s_clock_is_found_through_the_jitter_of_the_way(rng: np.random.Generator) -> None:

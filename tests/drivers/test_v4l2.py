@@ -98,15 +98,9 @@ def test_a_config_that_cannot_work_is_refused_at_once(tmp_path: Path, settings: 
     assert says in str(caught.value)
 
 
-def test_uncalibrated_it_gives_images_for_calibrating_and_says_so(machine: Machine, tmp_path: Path) -> None:
-    device = machine.plug(Sensor(sizes=((64, 48), (80, 60))), 0)
-    with v4l2(device, tmp_path, calibration="", uncalibrated=True, width=80, height=60) as camera:
-        image = next(iter(camera))
-        assert image.rgb.shape == (60, 80, 3)
-        assert any("not calibrated" in trouble for trouble in camera.warnings)
-
-
-def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machine, tmp_path: Path) -> None:
+def test_unplugged_it_is_waited_for_found_under_another_index_and_can_be_stopped(
+    machine: Machine, tmp_path: Path
+) -> None:
     sensor, other = Sensor(level=100), Sensor(card="Other", level=200)
     device = machine.plug(sensor, 0)
     with v4l2(device, tmp_path) as camera:
@@ -121,15 +115,23 @@ def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machi
         until(lambda: camera.warnings == ())
         assert (after.rgb[0, 0] == (100, 50, 0)).all()  # not the other one
         assert after.seq > before.seq + 1
+        machine.unplug(sensor)
+        until(lambda: camera.warnings != ())
+        threading.Timer(0.1, camera.stop).start()
+        assert len(list(images)) <= 1, "stopped from another thread while it is gone"
 
 
-def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_path: Path) -> None:
+def test_a_stream_that_stalls_is_told_even_while_a_read_hangs_and_started_anew(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.drivers.fake_v4l2.SELECT_S", 1.0)
     sensor = Sensor()
-    device = machine.plug(sensor, 0)
-    with v4l2(device, tmp_path, stall_s=1.0) as camera:
+    with v4l2(machine.plug(sensor, 0), tmp_path, stall_s=0.3) as camera:
         images = iter(camera)
         before = next(images)
         sensor.stalled = True
+        until(lambda: any("the stream has stalled" in t for t in camera.warnings))
+        assert sensor.opens == 1
         until(lambda: any("gives no images" in t for t in camera.warnings))
         going_ns = time.monotonic_ns()
         sensor.stalled = False
@@ -139,22 +141,11 @@ def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_pat
         until(lambda: camera.warnings == ())
 
 
-def test_a_read_that_hangs_is_told_while_it_hangs(
-    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tests.drivers.fake_v4l2.SELECT_S", 1.5)
-    sensor = Sensor()
-    with v4l2(machine.plug(sensor, 0), tmp_path, stall_s=0.1) as camera:
-        next(iter(camera))
-        sensor.stalled = True
-        until(lambda: any("the stream has stalled" in t for t in camera.warnings))
-        assert sensor.opens == 1
-
-
 def test_single_damaged_images_are_gaps_and_no_reason_to_start_anew(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sensor = Sensor()
+    """Of an uncalibrated camera, which gives images for calibrating and says so."""
+    sensor = Sensor(sizes=((64, 48), (80, 60)))
     read = [0]
     whole = Capture.read
 
@@ -164,10 +155,11 @@ def test_single_damaged_images_are_gaps_and_no_reason_to_start_anew(
         return whole(capture)
 
     monkeypatch.setattr(Capture, "read", every_third)
-    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
-        seqs = [image.seq for image in islice(camera, 8)]
-        assert sensor.opens == 1
-    assert all(seq % 3 != 2 for seq in seqs) and seqs[-1] >= 10
+    wish = {"calibration": "", "uncalibrated": True, "width": 80, "height": 60}
+    with v4l2(machine.plug(sensor, 0), tmp_path, **wish) as camera:
+        images = list(islice(camera, 8))
+        assert sensor.opens == 1 and any("not calibrated" in trouble for trouble in camera.warnings)
+    assert all(image.seq % 3 != 2 and image.rgb.shape == (60, 80, 3) for image in images) and images[-1].seq >= 10
 
 
 def test_a_device_in_use_or_that_is_none_is_told(
@@ -226,19 +218,6 @@ def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -
     assert rows == [("v4l2", "Grabber", str(plain)), ("v4l2", "?", str(dead)), ("v4l2", "HD Webcam", str(link))]
     notes = [c.note for c in list_devices()]
     assert notes[2] == "video10; MJPG YUYV; uvcvideo at usb-1.2" and "does not answer" in notes[1]
-
-
-def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_gone(
-    machine: Machine, tmp_path: Path
-) -> None:
-    sensor = Sensor()
-    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
-        images = iter(camera)
-        next(images)
-        machine.unplug(sensor)
-        until(lambda: camera.warnings != ())
-        threading.Timer(0.1, camera.stop).start()
-        assert len(list(images)) <= 1
 
 
 def test_a_failure_of_the_reading_thread_is_no_silence(

@@ -1,4 +1,4 @@
-"""Sources on the host in place of the device's: recordings that DepthAI replays, and nodes that send given messages."""
+"""Sources on the host in place of the device's: nodes that send given messages."""
 
 from __future__ import annotations
 
@@ -133,20 +133,6 @@ def camera(*connections: Callable[[], Sources], config: Config = CONFIG) -> Live
     """The driver's camera on these sources, one after the other; each may raise a ``CameraError``."""
     rest = list(connections)
     return open_camera(config, "front", connect=lambda _: rest.pop(0)())
-
-
-def replayed(folder: Path, calibration: Path) -> Sources:
-    """Sources that replay a recording by DepthAI's own nodes."""
-    pipeline = dai.Pipeline(False)
-    rgb = pipeline.create(dai.node.ReplayVideo)
-    rgb.setReplayVideoFile(folder / "rgb.mp4")
-    rgb.setReplayMetadataFile(folder / "rgb.mcap")
-    rgb.setOutFrameType(dai.ImgFrame.Type.NV12)
-    rgb.setLoop(False)
-    depth = pipeline.create(dai.node.ReplayMessage)
-    depth.setReplayFile(folder / "depth.mcap")
-    depth.setLoop(False)
-    return sources_of(pipeline, {"rgb": rgb.out, "depth": depth.out}, calibration)
 
 
 class SlowTracker(dai.node.ThreadedHostNode):
