@@ -222,26 +222,25 @@ def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, 
             bar.set(done, _STAGES.get(what, what))
 
         report = import_film(source, log, options, show, overwrite=overwrite)
-    output.print(
-        f"{log}: {counted(report.frames, 'frame')} of {report.looked_at}, {report.bytes / 1e6:.1f} MB, from a film"
-    )
+    frames, megabytes = len(report.T_world_camera), log.stat().st_size / 1e6
+    output.print(f"{log}: {counted(frames, 'frame')} of {report.note.frames}, {megabytes:.1f} MB, from a film")
     for name, value in film_figures(report).items():
         output.print(f"  {name}: {value}")
     for notice in report.notices:
         output.print(f"  note: {notice}")
-    output.lines([f"  left out: {p.start_s:.2f} to {p.end_s:.2f} s: {p.reason}" for p in report.left_out])
+    output.lines([f"  left out: {stretch}" for stretch in report.left_out])
 
 
 def film_figures(report: FilmReport) -> Mapping[str, str]:
     """What became of a film, for people, by name."""
-    unit = length_unit(bool(report.scale))
+    unit, note = length_unit(bool(report.scale)), report.note
     found = {
         "scale": report.scale or "unknown: lengths are not metres",
-        "registered": f"{report.registered} of {report.picked} frames that structure from motion was given",
-        "in the log": f"{report.frames} of {report.looked_at} frames of the film",
-        "left out": ", ".join(f"{count} {reason}" for reason, count in report.left_out_counts.items()) or "none",
-        "reprojection error": f"{report.error_px:.2f} px, mean over {report.points} points",
-        "focal length": f"{report.focal_px:.1f} px of the film, {report.focal_source}",
+        "registered": f"{note.registered} of {note.picked} frames that structure from motion was given",
+        "in the log": f"{len(report.T_world_camera)} of {note.frames} frames of the film",
+        "left out": ", ".join(f"{count} {reason}" for reason, count in note.left_out.items()) or "none",
+        "reprojection error": f"{note.error_px:.2f} px, mean over {report.points} points",
+        "focal length": f"{note.focal_px:.1f} px of the film, {report.focal_source}",
         "distortion": ", ".join(f"{value:.4f}" for value in report.distortion) or "none",
         "way": f"{report.path_m:.2f} {unit}",
     }

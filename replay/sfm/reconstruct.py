@@ -79,55 +79,24 @@ class FilmOptions:
     quarters: int = 0  # turn every frame clockwise by this many quarters
 
 
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """Frames one after the other that are not in the log."""
-
-    reason: str
-    start_s: float  # time of the first
-    end_s: float  # and of the last
-    frames: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmReport:
     """What became of a film."""
 
-    film: Path  # its file or folder
-    looked_at: int  # frames of the film
-    # picked, registered: Frames that structure from motion was given, and has registered.
-    picked: int
-    registered: int
-    left_out: tuple[LeftOut, ...]  # frames that are not in the log, in order
-    error_px: float  # mean reprojection error of the points
-    points: int  # how many there are
-    focal_px: float  # of the frames before they are rectified, in pixels of the film
-    focal_source: str  # where it comes from
+    note: FilmNote  # as the log keeps it
+    left_out: tuple[str, ...]  # stretches of frames that are not in the log, in order: when, and why
+    points: int  # of the model
+    focal_source: str  # where the focal length comes from
     distortion: tuple[float, ...]  # OpenCV's coefficients
     scale: str  # how the scale was found; empty = unknown
     height_m: float | None  # median height of the camera over the floor; None where no floor is found
     T_world_camera: Float64  # (N, 4, 4) of the N frames in the log
     notices: tuple[str, ...]  # sentences on what had to be assumed
-    info: StreamInfo  # what stands in the log's head
-    bytes: int  # size of the log
-
-    @property
-    def frames(self) -> int:
-        """In the log."""
-        return len(self.T_world_camera)
 
     @property
     def path_m(self) -> float:
         """Length of the way; in the log's own unit where the scale is unknown."""
         return float(np.linalg.norm(np.diff(self.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
-
-    @property
-    def left_out_counts(self) -> dict[str, int]:
-        """Frames that are not in the log, by reason."""
-        counts: Counter[str] = Counter()
-        for part in self.left_out:
-            counts[part.reason] += part.frames
-        return dict(counts)
 
 
 def import_film(
@@ -139,11 +108,9 @@ def import_film(
     found. Pictures with GPS positions place it instead, unless a scale is given: x is east, y north, z up, in
     metres from the first one's position. Deterministic: the same film, options and machine give the same poses.
 
-    Raises:
-        ImportSourceError: no film, no poses can be found, or nothing of what was to tell the scale is found in it.
-        ConfigError: a calibration that does not fit.
-        DependencyError: pycolmap is not installed.
-        LogError: ``dst`` is there already, or cannot be written.
+    Raises ImportSourceError: no film, no poses can be found, or nothing of what was to tell the scale is found in it.
+    ConfigError: a calibration that does not fit. DependencyError: pycolmap is not installed. LogError: ``dst`` is there
+    already, or cannot be written.
     """
     colmap.require_colmap()
     film = Film(src, options.quarters)
@@ -158,7 +125,7 @@ class _Lens:
     def __init__(self, film: Film, options: FilmOptions) -> None:
         self.rectify: Rectifier | None = None
         self.measured: CameraIntrinsics | None = None
-        ratio = film.width / film.full_width
+        self.ratio = film.width / film.full_width  # of what is seen to the film
         self.priors = tuple(f * max(film.width, film.height) for f in FOCAL_PRIORS)
         self.source, self.about = "found, beginning with usual lenses", False
         if film.focal_px is not None:
@@ -170,7 +137,7 @@ class _Lens:
                     f"--focal-prior {options.focal_prior_px:g}: is no focal length in pixels of pictures of "
                     f"{film.full_width}x{film.full_height}; most lenses have 0.6 to 1.5 times the width"
                 )
-            self.priors = tuple(f * options.focal_prior_px * ratio for f in RETRY_PRIORS)
+            self.priors = tuple(f * options.focal_prior_px * self.ratio for f in RETRY_PRIORS)
             self.source, self.about = f"found, beginning with the given {options.focal_prior_px:g}", False
         if options.calibration is None:
             return
@@ -189,7 +156,8 @@ class _Lens:
         return bgr if self.rectify is None else np.asarray(cv2.cvtColor(self.rectify(bgr), cv2.COLOR_RGB2BGR), np.uint8)
 
     def seen_pixel(self, u: float, v: float) -> tuple[float, float]:
-        """A pixel of the film, made smaller, in what is seen."""
+        """A pixel of the film in what is seen."""
+        u, v = u * self.ratio, v * self.ratio
         if self.rectify is None or self.measured is None:
             return u, v
         lens = np.array(self.measured.distortion or (0.0,) * 4)
@@ -274,10 +242,7 @@ class _Import:
                 return
 
     def _map(self, picked: list[int]) -> tuple[colmap.ColmapModel, float]:
-        """The largest model of the best attempt, and its mean reprojection error.
-
-        Raises ImportSourceError: see ``refusals``.
-        """
+        """The largest model of the best attempt, and its mean reprojection error."""
 
         def progress(line: str) -> None:
             what, done, total = line.split()
@@ -296,7 +261,7 @@ class _Import:
             raise ImportSourceError(f"{film.path}: {refusals.TURNING}")
         self._notices += refusals.baseline_notes(outcome.best.ahead, angle_deg, outcome.focal_sigma)
         if outcome.focal is not None and self._lens.measured is not None:
-            given_px = self._lens.measured.fx * film.full_width / film.width
+            given_px = self._lens.measured.fx / self._lens.ratio
             self._notices += refusals.focal_note(film.path, self._options.calibration, given_px, outcome.focal)
         self._notices += [
             f"the part from {times[min(span)]:.1f} to {times[max(span)]:.1f} s ({counted(len(span), 'view')}) "
@@ -318,8 +283,8 @@ class _Import:
         up = vertical(self._edges, _poses(frames), seen, guess)
         if up is None:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
-        frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
-        frames = _moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values())))
+        T_level_world = upright(frames[min(frames)].T_world_camera, guess if up is None else up)
+        frames = _moved(frames, T_level_world, UNSCALED_DEPTH_M / median_depth(list(frames.values())))
         fit = None
         if self._options.scale == ScaleHint():
             try:
@@ -378,7 +343,7 @@ class _Import:
             )
 
     def _marked_place(self, mark: Mark, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics) -> Float64:
-        look, ratio = self._look, self._film.width / self._film.full_width
+        look = self._look
         row = int(np.argmin(np.abs(look.stamp_ns - 1e9 * mark.time_s)))
         order = sorted(frames)
         rows = np.searchsorted(look.index, order)
@@ -391,7 +356,7 @@ class _Import:
         at, marked = int(np.searchsorted(rows, row)), int(look.index[row])
         chosen = {marked, *order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1]}
         pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
-        pixel = Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
+        pixel = Mark(mark.time_s, *self._lens.seen_pixel(mark.u, mark.v))
         return marked_place(pixel, marked, pictures, _poses(frames), seen)
 
     def _write(self, dst: Path, picked: list[int], scene: _Scene, error_px: float, *, overwrite: bool) -> FilmReport:
@@ -411,7 +376,7 @@ class _Import:
         info = StreamInfo(f"film {film.path.resolve().name}", cameras, frame_hz=film.hz, metadata=metadata)
         poses: list[Float64] = []
         reasons: list[tuple[str, float]] = []  # why each frame is left out, empty where it is not; and its time
-        focal_px = scene.seen.fx * film.full_width / film.width
+        focal_px = scene.seen.fx / self._lens.ratio
         with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
             for row, (frame, pose, reason) in enumerate(self._posed(set(picked), scene)):
                 self._progress("write", row + 1, len(look.index))
@@ -432,22 +397,15 @@ class _Import:
         points = np.unique(np.concatenate([frame.xyz for frame in scene.frames.values()]), axis=0)
         runs = [(reason, [s for _, s in run]) for reason, run in groupby(reasons, key=lambda item: item[0])]
         return FilmReport(
-            film=film.path,
-            looked_at=len(look.index),
-            picked=len(picked),
-            registered=len(scene.frames),
-            left_out=tuple(LeftOut(reason, s[0], s[-1], len(s)) for reason, s in runs if reason),
-            error_px=error_px,
-            points=len(points),
-            focal_px=focal_px,
-            focal_source=self._lens.source,
-            distortion=(self._lens.measured or scene.seen).distortion,
-            scale=scene.scale,
-            height_m=scene.height_m,
-            T_world_camera=np.stack(poses),
-            notices=tuple(self._notices),
-            info=info,
-            bytes=dst.stat().st_size,
+            note,
+            tuple(f"{s[0]:.2f} to {s[-1]:.2f} s: {reason}" for reason, s in runs if reason),
+            len(points),
+            self._lens.source,
+            (self._lens.measured or scene.seen).distortion,
+            scene.scale,
+            scene.height_m,
+            np.stack(poses),
+            tuple(self._notices),
         )
 
     def _posed(self, picked: set[int], scene: _Scene) -> Iterator[tuple[FilmFrame, Float64 | None, str]]:

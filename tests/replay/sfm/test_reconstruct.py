@@ -58,9 +58,10 @@ def report(walked: Walked) -> FilmReport:
 def test_a_film_comes_out_as_it_was_walked(walked: Walked, report: FilmReport) -> None:
     error, _ = path_error_m(walked[0].with_suffix(".mcap"), walked[1])
     assert error < 0.01
-    assert report.registered >= 0.95 * report.picked and report.frames >= 0.6 * COUNT
-    assert report.focal_px == pytest.approx(films.CAMERA.fx, rel=0.02) and report.error_px < 1.0
-    assert sum(report.left_out_counts.values()) + report.frames == COUNT == report.looked_at
+    note, frames = report.note, len(report.T_world_camera)
+    assert note.registered >= 0.95 * note.picked and frames >= 0.6 * COUNT
+    assert note.focal_px == pytest.approx(films.CAMERA.fx, rel=0.02) and note.error_px < 1.0
+    assert sum(note.left_out.values()) + frames == COUNT == note.frames
 
 
 def test_the_log_says_what_it_is(walked: Walked, report: FilmReport) -> None:
@@ -132,8 +133,8 @@ def test_a_calibrated_film_gets_its_scale_from_two_marked_points(tmp_path: Path,
     hint = ScaleHint(distance=(marks[0], marks[1], float(np.linalg.norm(a[2] - b[2]))))
     found = import_film(walked[0], tmp_path / "a.mcap", FilmOptions(tmp_path / "camera.toml", scale=hint), quiet)
     error, scale = path_error_m(tmp_path / "a.mcap", walked[1])
-    assert found.info.scale_known and error < 0.01 and scale == pytest.approx(1, abs=0.1)
-    assert found.focal_px == pytest.approx(films.CAMERA.fx)
+    assert found.scale and error < 0.01 and scale == pytest.approx(1, abs=0.1)
+    assert found.note.focal_px == pytest.approx(films.CAMERA.fx)
 
 
 @pytest.mark.slow
