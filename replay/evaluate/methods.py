@@ -8,7 +8,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.errors import FrameError, LabelError
@@ -30,11 +32,10 @@ _log = get_logger(__name__)
 
 
 class Opinion(NamedTuple):
-    """What a method says of a frame: ids (H, W) uint8, the ignore id = unknown, and their probability (H, W) float32;
-    None where the method has none."""
+    """What a method says of a frame."""
 
-    label: UInt8
-    confidence: Float32 | None = None
+    label: UInt8  # (H, W) ids, the ignore id = unknown
+    confidence: Float32 | None = None  # (H, W) their probabilities, None where the method has none
 
 
 SURE = 0.9  # confidence of a pixel that a user would keep
@@ -68,50 +69,69 @@ class Evaluation:
         return {name: getattr(self, name) for name in self.__slots__ if name != "segments"}
 
 
+class _Scores:
+    """Of one method."""
+
+    def __init__(self, label_set: LabelSet) -> None:
+        self.confusion, self.segments = ConfusionMatrix(label_set), Segments(label_set)
+        self.confidence = ConfidenceScores()
+
+    def add(self, truth: UInt8, found: Opinion, known: NDArray[np.bool_], where: str) -> None:
+        """Count one image, or the points of a map; ``known`` are the pixels whose confidence counts."""
+        image = confusion_of(truth, found.label, self.confusion.label_set, where)
+        self.confusion += image
+        self.segments.add(image)
+        if found.confidence is not None:
+            strange = truth == self.confusion.label_set.ignore_id
+            self.confidence.update(found.confidence[known], (found.label == truth)[known], strange[known])
+
+    def figures(self) -> dict[str, Any]:
+        sure, right = self.confidence.above(SURE)
+        return asdict(self.confusion.metrics()) | {
+            "ece": self.confidence.calibration_error,
+            "sure": sure,
+            "sure_right": right,
+            "open_set_auroc": self.confidence.open_set_auroc,
+        }
+
+
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
     """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
     encoder says of the frame alone, where it has an opinion of single images."""
-    config = bundle.pipeline.config
+    config, model = bundle.pipeline.config, bundle.checkpoint.model
     keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
     novel = msgspec.structs.replace(config, keyframes=keyframes)
     pipeline = MappingPipeline(
-        novel, make_field(bundle.checkpoint.model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
+        novel, make_field(model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
     )
-    kind = bundle.checkpoint.model.kind
-    found: dict[str, Predictor] = {
-        kind: lambda frame: _mapped(bundle.pipeline, frame),
-        f"{kind}, novel view": lambda frame: _mapped(pipeline, frame),
-    }
-    if bundle.checkpoint.model.classifies_images and kind != "unet":
-        found["own image alone"] = lambda frame: _of_image(bundle, frame)
-    return found
+
+    def predictor(pipeline: MappingPipeline) -> Predictor:
+        def mapped(frame: PosedFrame) -> Opinion:
+            update = pipeline.step(frame)
+            return Opinion(update.label, update.confidence)
+
+        return mapped
+
+    def of_image(frame: PosedFrame) -> Opinion:
+        """What encoder and classifier make of the image by itself, at the size that the pipeline works at."""
+        width = min(config.render.encode_width or frame.intrinsics.width, frame.intrinsics.width)
+        view = view_from_frame(replace(frame, label=None), model.label_set, width)
+        with torch.inference_mode():
+            logits = model.source_logits(model.encode(stack_sources([view])))
+            assert logits is not None  # it classifies images
+            size = (frame.intrinsics.height, frame.intrinsics.width)
+            large = functional.interpolate(logits.float(), size=size, mode="bilinear", align_corners=False)
+            confidence, channel = torch.softmax(large[0], dim=0).max(dim=0)
+        return Opinion(model.label_set.to_ids(channel.numpy()), confidence.numpy())
+
+    found = {model.kind: predictor(bundle.pipeline), f"{model.kind}, novel view": predictor(pipeline)}
+    return found | ({"own image alone": of_image} if model.classifies_images and model.kind != "unet" else {})
 
 
 def thing_tellers(bundle: Mapper) -> dict[str, ThingTeller]:
     """The predictors of ``field_predictors`` that tell things apart by themselves, and how: those of boxes."""
     model = bundle.checkpoint.model
-    if not isinstance(model, Panoptic):
-        return {}
-    return {model.kind: partial(thing_image, model)}
-
-
-def _mapped(pipeline: MappingPipeline, frame: PosedFrame) -> Opinion:
-    update = pipeline.step(frame)
-    return Opinion(update.label, update.confidence)
-
-
-def _of_image(bundle: Mapper, frame: PosedFrame) -> Opinion:
-    """What the field's encoder and classifier make of the image by itself, at the size that the pipeline works at."""
-    model, config = bundle.checkpoint.model, bundle.pipeline.config
-    width = min(config.render.encode_width or frame.intrinsics.width, frame.intrinsics.width)
-    view = view_from_frame(replace(frame, label=None), model.label_set, width)
-    with torch.inference_mode():
-        logits = model.source_logits(model.encode(stack_sources([view])))
-        assert logits is not None  # or the caller would not ask
-        size = (frame.intrinsics.height, frame.intrinsics.width)
-        large = functional.interpolate(logits.float(), size=size, mode="bilinear", align_corners=False)
-        confidence, channel = torch.softmax(large[0], dim=0).max(dim=0)
-    return Opinion(model.label_set.to_ids(channel.numpy()), confidence.numpy())
+    return {model.kind: partial(thing_image, model)} if isinstance(model, Panoptic) else {}
 
 
 def baseline_predictors(
@@ -153,9 +173,7 @@ def evaluate_frames(
     """
     surface = SurfaceTruth(stream_labels)
     truth_mapper = TruthMapper(stream_labels, label_set)
-    confusions = {name: ConfusionMatrix(label_set) for name in predictors}
-    confidences = {name: ConfidenceScores() for name in predictors}
-    segments = {name: Segments(label_set) for name in predictors}
+    scores = {name: _Scores(label_set) for name in predictors}
     scored = excluded = refused = pseudo = 0
     for index, frame in enumerate(frames):
         where = f"frame seq={frame.seq}"
@@ -173,46 +191,28 @@ def evaluate_frames(
                 if panoptic is not None:
                     found = {name: partial(tell, frame, predicted[name].label) for name, tell in things.items()}
                     panoptic.add(frame, truth, found)
-                labelled = frame.label != stream_labels.ignore_id
-                strange = labelled & (truth == label_set.ignore_id)
                 for name, opinion in predicted.items():
-                    image = confusion_of(truth, opinion.label, label_set, where)
-                    confusions[name] += image
-                    segments[name].add(image)
-                    if opinion.confidence is not None:
-                        correct = opinion.label[labelled] == truth[labelled]
-                        confidences[name].update(opinion.confidence[labelled], correct, strange[labelled])
+                    scores[name].add(truth, opinion, frame.label != stream_labels.ignore_id, where)
         except (FrameError, LabelError) as error:
             refused += 1
             _log.error("frame_refused", seq=frame.seq, reason=str(error))
         if on_frame is not None:
             on_frame(index + 1)
-    rejected: float | None = None
+    methods = {name: of.figures() for name, of in scores.items()}
     if voxel_map is not None:
         points = voxel_map.points()
         labels = surface.labels_at(points.xyz)
         labelled = labels != stream_labels.ignore_id
         if labelled.any():
-            truth, answer = truth_mapper.to_map_ids(labels, MAP), points.label
-            confusions[MAP], confidences[MAP] = ConfusionMatrix(label_set), ConfidenceScores()
-            confusions[MAP].update(truth, answer, MAP)
-            strange, voted = truth == label_set.ignore_id, labelled & (points.confidence > 0)
-            found = answer[strange & voted] == label_set.ignore_id
-            rejected = float(found.mean()) if len(found) else None
-            confidences[MAP].update(points.confidence[voted], (answer == truth)[voted], strange[voted])
-    methods: dict[str, dict[str, Any]] = {
-        name: asdict(matrix.metrics()) | _of_confidence(confidences[name]) for name, matrix in confusions.items()
-    }
-    if MAP in methods:
-        methods[MAP]["open_set_unknown"] = rejected
-    if panoptic is not None and voxel_map is not None:
-        methods[SEEN] = {**panoptic.score(voxel_map)}
-        for name, figures in panoptic.score_methods().items():
-            methods[name] |= figures
+            truth, voted = truth_mapper.to_map_ids(labels, MAP), labelled & (points.confidence > 0)
+            of_map = _Scores(label_set)
+            of_map.add(truth, Opinion(points.label, points.confidence), voted, MAP)
+            strange = points.label[(truth == label_set.ignore_id) & voted]
+            rejected = float((strange == label_set.ignore_id).mean()) if len(strange) else None
+            methods[MAP] = of_map.figures() | {"open_set_unknown": rejected}
+        if panoptic is not None:
+            methods[SEEN] = {**panoptic.score(voxel_map)}
+            for name, figures in panoptic.score_methods().items():
+                methods[name] |= figures
+    segments = {name: of.segments for name, of in scores.items()}
     return Evaluation(methods, scored, excluded, refused, pseudo, segments=segments)
-
-
-def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:
-    sure, right = scores.above(SURE)
-    auroc = scores.open_set_auroc
-    return {"ece": scores.calibration_error, "sure": sure, "sure_right": right, "open_set_auroc": auroc}

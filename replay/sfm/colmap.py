@@ -29,10 +29,8 @@ LINK_MATCHES = 20  # of two frames that show one place
 FLAT = 0.93  # of the matches that one homography explains: nothing but a turn, or one plane
 TURNED = 0.8  # of the matches that a turn explains: nothing but that
 UNKNOWN_FOCAL = 0.3  # standard deviation of a focal length that usual lenses tell better than the film: it is assumed
-_LARGE, _LEAST_PRECISION = (
-    1280,
-    0.25,
-)  # pixels of the longer side from which on COLMAP's limits hold; their least factor
+_LARGE = 1280  # pixels of the longer side from which on COLMAP's limits hold
+_LEAST_PRECISION = 0.25  # least factor of them
 
 
 class Camera(msgspec.Struct, frozen=True):

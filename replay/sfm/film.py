@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,12 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.sfm.between import track
-from semantic_mapper.replay.sfm.gps import GpsPosition, read_position
+from semantic_mapper.replay.sfm.gps import GpsPosition, read_exif, read_position
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -29,7 +27,8 @@ PICTURE_HZ = 2.0  # at which the pictures of a folder count as taken
 MAX_FAILED = 1000  # reads one after the other: films may announce any number of frames
 DEFAULT_HZ = 30.0  # of a film that tells neither times nor a rate
 _TURNS = (None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE)
-_FOCAL_35MM, _DIAGONAL_35MM = 0xA405, 43.27  # EXIF: FocalLengthIn35mmFilm; the diagonal of its picture in mm
+# EXIF's directory of the camera; its FocalLengthIn35mmFilm; the diagonal of such a picture in mm
+_CAMERA, _FOCAL_35MM, _DIAGONAL_35MM = 0x8769, 0xA405, 43.27
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +106,12 @@ class Film:
 
     def _decoded_film(self) -> Iterator[tuple[int, int, np.ndarray]]:
         last_ns, read, failed = -1, 0, 0
-        with self._opened() as capture:
+        capture = cv2.VideoCapture(str(self.path))
+        try:
+            if not capture.isOpened():
+                raise ImportSourceError(
+                    f"{self.path}: is no film that OpenCV can decode; is it complete? convert it to H.264 in mp4"
+                )
             hz = capture.get(cv2.CAP_PROP_FPS)
             self.hz = hz if 0.01 < hz < 1000 else DEFAULT_HZ
             self.count = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
@@ -125,16 +129,6 @@ class Film:
                     stamp_ns = last_ns + round(1e9 / self.hz)
                 last_ns = stamp_ns
                 yield index, stamp_ns, bgr
-
-    @contextmanager
-    def _opened(self) -> Iterator[cv2.VideoCapture]:
-        capture = cv2.VideoCapture(str(self.path))
-        try:
-            if not capture.isOpened():
-                raise ImportSourceError(
-                    f"{self.path}: is no film that OpenCV can decode; is it complete? convert it to H.264 in mp4"
-                )
-            yield capture
         finally:
             capture.release()
 
@@ -147,11 +141,7 @@ def pictures_of(folder: Path) -> list[Path]:
 
 def focal_of_exif(file: Path, sides_px: tuple[int, ...]) -> float | None:
     """Focal length in pixels by the EXIF data of a picture with these sides; None where it does not tell one."""
-    try:
-        with Image.open(file) as image:
-            focal_mm = image.getexif().get_ifd(0x8769).get(_FOCAL_35MM, 0)
-    except (OSError, ValueError, SyntaxError):
-        return None
+    focal_mm = read_exif(file, _CAMERA).get(_FOCAL_35MM, 0)
     if not isinstance(focal_mm, int | float) or not 5 <= focal_mm <= 1000:
         return None
     return float(focal_mm) * float(np.hypot(sides_px[0], sides_px[1])) / _DIAGONAL_35MM

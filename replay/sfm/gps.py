@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -61,18 +62,25 @@ class GpsFit:
         return f"GPS of {counted(self.pictures, 'picture')}, {self.error_m:.2f} m off (median)"
 
 
-def read_position(file: Path) -> GpsPosition | None:
-    """Where a picture was taken by its EXIF data; None where these lack latitude, longitude or altitude."""
+def read_exif(file: Path, directory: int) -> dict[int, Any]:
+    """A directory of the EXIF data of a picture; empty without."""
     try:
         with Image.open(file) as image:
-            found = image.getexif().get_ifd(_GPS)
+            return image.getexif().get_ifd(directory)
+    except (OSError, ValueError, SyntaxError):
+        return {}
+
+
+def read_position(file: Path) -> GpsPosition | None:
+    """Where a picture was taken by its EXIF data; None where these lack latitude, longitude or altitude."""
+    found = read_exif(file, _GPS)
+    try:
         latitude, longitude = (_degrees(found[at], str(found.get(sign, ""))) for sign, at in (_LATITUDE, _LONGITUDE))
         altitude = float(found[_ALTITUDE])
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError, ZeroDivisionError):
-        return None  # not a picture with a position
-    if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) < 1e5):
+    except (ValueError, KeyError, TypeError, ZeroDivisionError):
         return None
-    if latitude == longitude == 0:  # a receiver without a fix
+    fixed = latitude or longitude  # 0, 0 is a receiver without a fix
+    if not (fixed and abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) < 1e5):
         return None
     return GpsPosition(latitude, longitude, -altitude if found.get(_BELOW_SEA) in (1, b"\x01") else altitude)
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import DepthFromMotionConfig
 from semantic_mapper.depth_from_motion.sweep import (
-    SweepResult,
     inverse_depths,
     relative_projections,
     stack_images,
@@ -42,9 +41,8 @@ AROUND = 9  # pixels a side in which other pixels support one
 class Agreement(NamedTuple):
     """What neighbours say of a depth image."""
 
-    # agree, visible: (h, w) uint8 neighbours whose depth agrees; that have a depth there.
-    agree: UInt8
-    visible: UInt8
+    agree: UInt8  # (h, w) uint8 how many have a depth that agrees
+    visible: UInt8  # (h, w) uint8 how many have a depth there
     mean_m: Float32  # (h, w) float32 depth averaged with those that agree, in inverse depth; 0 = none
 
 
@@ -66,10 +64,15 @@ def estimate_depth(
     depth = (1 / (first + swept.plane * step)).astype(np.float32)
     agreement = find_agreement(reference, depth, neighbours)
     plane = ((1 / agreement.mean_m - first) / step).astype(np.float32)
-    matched = _spread_of_match(swept, agreement)
+    agree, visible = agreement.agree.astype(np.float32), agreement.visible.astype(np.float32)
+    unsure, alone = (visible - agree) / 6, (swept.seen < 2).astype(np.float32)
+    agreeing = np.log1p(agree)
+    sure, far = np.log(swept.confidence + 0.02), np.log(agreement.mean_m)
+    matched = _spread(MATCHED, sure, agreeing, unsure, alone, far)  # of what was matched
     surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
     depth = (1 / (first + surface * step)).astype(np.float32)
-    sigma = _spread_of_surface(plane, surface, matched, agreement, depth)
+    around, off = cv2.blur(1 / matched**2, (AROUND, AROUND)) ** -0.5, np.log(np.abs(plane - surface) + 0.1)
+    sigma = _spread(SMOOTHED, np.log(matched), np.log(around), off, agreeing, np.log(depth))  # of the surface
     return DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32))
 
 
@@ -106,25 +109,8 @@ def _ties(one: UInt8, other: UInt8) -> Float32:
     return (TIE * np.maximum(np.exp(-step / COLOUR_SCALE), LEAST_TIE)).astype(np.float32)
 
 
-def _spread_of_match(swept: SweepResult, agreement: Agreement) -> Float32:
-    """Spread (h, w) of what was matched, in planes."""
-    agree, visible = agreement.agree.astype(np.float32), agreement.visible.astype(np.float32)
-    unsure, alone = (visible - agree) / 6, (swept.seen < 2).astype(np.float32)
-    terms = np.log(swept.confidence + 0.02), np.log1p(agree), unsure, alone, np.log(agreement.mean_m)
-    return _spread(MATCHED, *terms)
-
-
-def _spread_of_surface(
-    plane: Float32, surface: Float32, sigma: Float32, agreement: Agreement, depth_m: Float32
-) -> Float32:
-    """Spread (h, w) in planes of a surface of this depth, laid through planes that were matched with their spread."""
-    around = cv2.blur(1 / sigma**2, (AROUND, AROUND)) ** -0.5
-    agree, off = np.log1p(agreement.agree.astype(np.float32)), np.log(np.abs(plane - surface) + 0.1)
-    return _spread(SMOOTHED, np.log(sigma), np.log(around), off, agree, np.log(depth_m))
-
-
 def _spread(factors: tuple[float, ...], *terms: NDArray[np.floating]) -> Float32:
-    """The exponential (h, w) of the sum of terms, of which the first is 1, times their factors."""
+    """In planes, (h, w): the exponential of the sum of terms, of which the first is 1, times their factors."""
     stacked = np.stack((np.ones_like(terms[0]), *terms), axis=-1).astype(np.float32, copy=False)
     return np.clip(np.exp(stacked @ np.array(factors, np.float32)), LEAST, MOST).astype(np.float32)
 
@@ -143,7 +129,6 @@ def count_agreement(
     tolerance: float,
 ) -> None:
     """Write ``agree``, ``visible`` and ``mean`` (h, w) of `Agreement` with depths of neighbours (n, H, W)."""
-    ...
 
 
 @kernel
@@ -155,4 +140,3 @@ def relax_membrane(
     ``right`` and ``below`` (h, w) are ties to the pixel to the right, and below; those of the last column and row are
     not used. ``out`` (h, w) is the first guess, then the solution.
     """
-    ...

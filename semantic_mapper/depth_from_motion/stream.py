@@ -113,7 +113,9 @@ class DepthFromMotion:
         if not sources:  # the camera has not moved enough
             nothing = np.zeros(frame.rgb.shape[:2], np.float32)
             return replace(frame, depth_m=nothing, depth_sigma_m=nothing.copy())
-        estimate = estimate_depth(view, sources, self._config, hint, _nearest_estimates(view, others))
+        known = [other for other in others if other.estimate is not None]
+        nearest = [known[k] for k in np.argsort(_distances(view, known), kind="stable")[:NEIGHBOURS]]
+        estimate = estimate_depth(view, sources, self._config, hint, nearest)
         camera.usual_m = float(np.median(estimate.depth_m))
         camera.views[:] = [replace(view, estimate=estimate) if other is view else other for other in camera.views]
         full = enlarge_estimate(estimate, view.rgb, frame.rgb)
@@ -124,7 +126,9 @@ class DepthFromMotion:
         self._cameras.move_to_end(camera_id)
         camera.views.append(view)
         if len(camera.views) > MAX_VIEWS + self._config.delay_frames:
-            del camera.views[_least_useful(camera.views, RECENT_VIEWS + self._config.delay_frames)]
+            # Of all but the most recent views, the one that is nearest to its successor.
+            old = camera.views[: 1 - RECENT_VIEWS - self._config.delay_frames]
+            del camera.views[int(np.argmin([_distances(a, [b])[0] for a, b in itertools.pairwise(old)]))]
         if len(self._cameras) > MAX_CAMERAS:
             forgotten, _ = self._cameras.popitem(last=False)
             _log.warning("camera_forgotten", camera=forgotten, reason=f"depth is computed for {MAX_CAMERAS} cameras")
@@ -135,19 +139,8 @@ def _distances(view: PreparedView, others: list[PreparedView]) -> Float64:
     inverse = invert_pose(view.T_world_camera)
     ways = [inverse @ other.T_world_camera for other in others]
     return np.array(
-        [np.linalg.norm(T[:3, 3]) + TURN_WEIGHT_M * np.linalg.norm(rotation_vector(T)) for T in ways], np.float64
+        [float(np.linalg.norm(T[:3, 3]) + TURN_WEIGHT_M * np.linalg.norm(rotation_vector(T))) for T in ways]
     )
-
-
-def _least_useful(views: list[PreparedView], recent: int) -> int:
-    """Of all but the most recent views, the number of the one that is nearest to its successor."""
-    ways = [float(_distances(a, [b])[0]) for a, b in itertools.pairwise(views[: 1 - recent])]
-    return int(np.argmin(ways))
-
-
-def _nearest_estimates(view: PreparedView, others: list[PreparedView]) -> list[PreparedView]:
-    known = [other for other in others if other.estimate is not None]
-    return [known[k] for k in np.argsort(_distances(view, known), kind="stable")[:NEIGHBOURS]]
 
 
 def choose_sources(

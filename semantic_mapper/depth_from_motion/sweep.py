@@ -128,7 +128,6 @@ def sweep_planes(
     ``source_census`` are (n, H, W), projections lead to their pixels and are truncated; ``hint`` and ``hint_rate``
     (h, w) are a plane, < 0 = none, and 1 / planes by which it may be off.
     """
-    ...
 
 
 @parallel_kernel(chunks_per_thread=PATH_GROUPS)
@@ -139,11 +138,9 @@ def sum_paths(
 
     ``large_step`` (256,) is P2 by difference of gray, ``small_step`` P1, ``buffer`` (3, bytes) for states of the paths.
     """
-    ...
 
 
 @parallel_kernel()
 def pick_planes(count: int, path_sum: UInt16, cost: UInt8, plane: Float32, confidence: Float32, match: Float32) -> None:
     """Lowest plane of each pixel with a parabola through its neighbours: writes ``plane``, ``confidence`` and ``match``
     of `SweepResult`; the first of ``path_sum`` (3, h, w, D) becomes the sum of all three."""
-    ...

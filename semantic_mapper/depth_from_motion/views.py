@@ -30,12 +30,10 @@ class PreparedView:
 
     stamp_ns: int  # of the frame
     intrinsics: CameraIntrinsics  # at the working size (h, w)
-    # of the image at twice the size. Pixel k of ``census`` covers coordinates k to k + 1 of it.
-    intrinsics_double: CameraIntrinsics
+    intrinsics_double: CameraIntrinsics  # at twice the size. Pixel k of ``census`` covers coordinates k to k + 1 of it.
     T_world_camera: Float64  # (4, 4) float64
-    # rgb, gray: (h, w, 3), (h, w) uint8.
-    rgb: UInt8
-    gray: UInt8
+    rgb: UInt8  # (h, w, 3) uint8
+    gray: UInt8  # (h, w) uint8
     census: Int32  # (2h, 2w) int32; pixel (2y, 2x) belongs to pixel (y, x) of the working size
     estimate: DepthEstimate | None = None  # depth that was found for the view earlier; None where there was none
 
@@ -90,7 +88,6 @@ def enlarge_estimate(estimate: DepthEstimate, coarse_rgb: UInt8, rgb: UInt8) -> 
 @parallel_kernel()
 def compare_with_middle(count: int, padded: UInt8, census: Int32, spacing: int) -> None:
     """`census_transform` of an image that has a margin of 2 * spacing on each side; writes ``census`` (H, W)."""
-    ...
 
 
 @parallel_kernel()
@@ -109,4 +106,3 @@ def enlarge_depth(
 
     A coarse pixel counts by exp(-colour_rate * squared distance of the colours).
     """
-    ...

@@ -33,8 +33,7 @@ class SegmentationMetrics:
     total_accuracy: float | None  # fraction of the pixels that are right
     average_accuracy: float | None  # mean over the classes in the truth of the fraction of their pixels that is right
     coverage: float | None  # fraction of the pixels with any prediction but "unknown"
-    # IoU by class name, for the classes that occur in the truth, in the label set's order
-    per_class: dict[str, float] = field(default_factory=dict[str, float])
+    per_class: dict[str, float] = field(default_factory=dict[str, float])  # IoU, in the label set's order
     pixels: int = 0  # how many pixels were counted
 
 
@@ -42,15 +41,11 @@ _FIGURES = ("miou", "total_accuracy", "average_accuracy", "coverage")
 
 
 class ConfusionMatrix:
-    """Counts of (true class, predicted class) pixels of a label set; adds up over images, frames and processes.
-
-    Attributes:
-        label_set: Whose classes the rows and columns are, in channel order.
-        counts: (L, L + 1) int64; row = truth, column = prediction, the last column = predicted "unknown".
-    """
+    """Counts of (true class, predicted class) pixels of a label set; adds up over images, frames and processes."""
 
     def __init__(self, label_set: LabelSet) -> None:
         self.label_set = label_set
+        # (L, L + 1) in channel order; row = truth, column = prediction, the last column = predicted "unknown"
         self.counts: NDArray[np.int64] = np.zeros((len(label_set), len(label_set) + 1), np.int64)
 
     def update(self, truth: UInt8, predicted: UInt8, where: str = "label image") -> None:
@@ -135,8 +130,7 @@ class ImageMeans:
 class ConfidenceScores:
     """Whether confidence means something, over any number of images: of calibration, and of strange things."""
 
-    _BINS = 15
-    _FINE = 100  # fine bins in one of calibration
+    _BINS, _FINE = 15, 100  # of calibration; fine bins in one of them
 
     def __init__(self) -> None:
         size = self._BINS * self._FINE

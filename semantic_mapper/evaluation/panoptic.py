@@ -50,16 +50,13 @@ class ClassQuality:
 class PanopticMetrics:
     """Means over the classes that were true or found somewhere, in 0..1; None without such classes."""
 
-    # pq, sq, rq, pq_plus: Of all classes.
-    pq: float | None = None
+    pq: float | None = None  # of all classes, as the next three
     sq: float | None = None
     rq: float | None = None
     pq_plus: float | None = None
-    # pq_things, pq_stuff: PQ of a part of them.
-    pq_things: float | None = None
+    pq_things: float | None = None  # of a part of them, as the next
     pq_stuff: float | None = None
-    # by name, in the label set's order
-    per_class: dict[str, ClassQuality] = field(default_factory=dict[str, ClassQuality])
+    per_class: dict[str, ClassQuality] = field(default_factory=dict[str, ClassQuality])  # in the label set's order
     segments: int = 0  # true segments
 
 

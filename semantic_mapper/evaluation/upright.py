@@ -39,20 +39,20 @@ def upright_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float
     """Rotation ``R_upright_world`` after which z is up and most walls run along x or y, the longer side along x.
 
     Floors, tables and ceilings make the histogram of heights sharp, walls those of x and y: the rotation is the one
-    that makes them sharpest. Deterministic; the identity where there are no points and no ``up``. Raises ShapeError:
-    ``xyz`` is not (N, 3), or ``up`` has no direction.
-
-    Args:
-        xyz: (N, 3) world points in metres, N may be 0.
-        up: (3,) rough direction in the world frame; ten degrees off is corrected, and so is any error up to 45 degrees
-            where the truth is an axis of the world. ``None`` tries the six axes.
+    that makes them sharpest, of points (N, 3) in metres, N may be 0. ``up`` (3,) is a rough direction: ten degrees off
+    is corrected, and so is any error up to 45 degrees where the truth is an axis of the world; None tries the six axes.
+    Deterministic; the identity where there are no points and no ``up``. Raises ShapeError: ``xyz`` is not (N, 3), or
+    ``up`` has no direction.
     """
     if up is not None and not np.linalg.norm(up) > 0:
         raise ShapeError(f"up: expected a direction (3,), got {up}")
     points = _sample(xyz)
     if len(points) < 10:
         return _rotation_to_z(up) if up is not None else np.eye(3)
-    guesses = [_axis_up(points)] if up is None else [up / np.linalg.norm(up), *_axes_near(up)]
+    guesses = [_axis_up(points)]
+    if up is not None:  # and axes of the world within 45 degrees: most recordings have one of them along gravity
+        axes = np.concatenate((np.eye(3), -np.eye(3)))
+        guesses = [up / np.linalg.norm(up), *axes[axes @ up > np.cos(np.pi / 4) * np.linalg.norm(up)]]
     refined = [_refine_tilt(points, _rotation_to_z(guess)) for guess in guesses]
     R = _align_walls(points, min(refined, key=lambda turned: _spread(points @ turned[2])))
     x, y, _ = np.ptp(points @ R.T, axis=0)
@@ -114,18 +114,9 @@ def _rotation_to_z(up: Float64) -> Float64:
     return np.stack((x, np.cross(z, x), z))
 
 
-def _axes_near(up: Float64) -> list[Float64]:
-    """Axes of the world within 45 degrees of ``up``: most recordings have one of them along gravity."""
-    axes = np.concatenate((np.eye(3), -np.eye(3)))
-    return list(axes[axes @ up > np.cos(np.pi / 4) * np.linalg.norm(up)])
-
-
 def _axis_up(points: Float64) -> Float64:
     """The axis along which the points form the sharpest layers, pointing away from the fullest layer (the floor)."""
-    if len(points) < 10:
-        return np.array((0.0, 0.0, 1.0))
-    axis = int(np.argmin([_spread(points[:, i]) for i in (2, 1, 0)]))
-    axis = (2, 1, 0)[axis]
+    axis = min((2, 1, 0), key=lambda i: _spread(points[:, i]))
     counts, edges = np.histogram(points[:, axis], bins=np.arange(*_bounds(points[:, axis]), BIN_M))
     fullest = edges[int(np.argmax(counts))]
     sign = 1.0 if fullest <= np.median(points[:, axis]) else -1.0
