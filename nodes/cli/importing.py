@@ -118,14 +118,13 @@ def import_(
     if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
         _recover(output, source, log)
         return
-    renames = load_config(rename, RenameConfig).classes if rename is not None else None
+    renames = load_config(rename, RenameConfig).classes if rename is not None else {}
     log.parent.mkdir(parents=True, exist_ok=True)
-    if format_ is None and is_film(source) and (renames is not None or max_frames or every > 1):
+    if format_ is None and is_film(source) and (rename is not None or max_frames or every > 1):
         raise typer.BadParameter("a film has no classes to rename, and all of it is read")
-    reading = ImportOptions(
-        max_frames=max_frames or None, every=every, topics=_topics_by_role(topic or []), world=world, body=body
-    )
-    import_source(output, source, log, options, format_, reading, renames, overwrite=overwrite)
+    topics = _topics_by_role(topic or [])
+    reading = ImportOptions(every, max_frames or None, topics=topics, renames=renames, world=world, body=body)
+    import_source(output, source, log, options, format_, reading, overwrite=overwrite)
 
 
 def is_film(source: Path) -> bool:
@@ -142,7 +141,6 @@ def import_source(
     options: SourceOptions,
     format_name: str | None = None,
     reading: ImportOptions | None = None,
-    renames: dict[str, str] | None = None,
     *,
     overwrite: bool,
 ) -> int:
@@ -159,9 +157,7 @@ def import_source(
                 bar.start(total)
             bar.set(done)
 
-        report = import_recording(
-            source, log, format_name, on_progress, options=reading, renames=renames, overwrite=overwrite
-        )
+        report = import_recording(source, log, format_name, on_progress, options=reading, overwrite=overwrite)
     _print_import(output, report, log)
     return report.with_depth
 

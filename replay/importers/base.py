@@ -43,6 +43,7 @@ class ImportOptions:
     # ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth "none", of
     # every format: without.
     topics: Mapping[str, str] = field(default_factory=dict[str, str])
+    renames: Mapping[str, str] = field(default_factory=dict[str, str])  # new names of classes, by their present ones
     world: str = ""  # ROS bags: frame of tf in which poses are; empty = map, world or odom
     body: str = ""  # ROS bags: frame whose pose the topic of poses tells; empty = as its messages say
     # metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known
@@ -120,13 +121,13 @@ class BadFrameError(ImportSourceError):
         self.reason = reason
 
 
-def read_bytes(file: Path) -> bytes:
+def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All of one file of a recording.
 
-    Raises BadFrameError: missing, no regular file (a pipe may never end), or larger than any image or list of poses.
+    Raises BadFrameError: missing, no regular file (a pipe may never end), or larger than ``limit`` bytes.
     """
     try:
-        return read_regular(file, MAX_FILE_BYTES)
+        return read_regular(file, limit)
     except ConfigError as error:
         raise BadFrameError(file, str(error).removeprefix(f"{file}: ")) from error
     except OSError as error:
@@ -230,13 +231,8 @@ def read_plane(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Single-channel PNG as it is: (H, W) uint8 or uint16.
 
-    Raises BadFrameError: missing, damaged, of another type or size.
-
-    Args:
-        file: To read.
-        kind: "uint8", "uint16", or "any" of the two.
-        size: (height, width) that it must have; None = any.
-        what: It shows, for errors.
+    ``size`` is (height, width), None = any; ``what`` it shows, for errors. Raises BadFrameError: missing, damaged, of
+    another type or size.
     """
     data = read_bytes(file)
     try:

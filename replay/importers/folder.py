@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from semantic_mapper.errors import ImportSourceError, LabelError
@@ -27,7 +26,6 @@ from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.replay.importers.base import (
     DEPTHS,
     PICTURES,
-    BadFrameError,
     DepthScale,
     ImportOptions,
     camera_of,
@@ -39,21 +37,17 @@ from semantic_mapper.replay.importers.tables import (
     numbered_files,
     read_plain_json,
     read_pose_rows,
-    read_rows,
+    read_stamps,
     refuse_keys,
-    seconds_to_ns,
     unknown_notice,
     without_picture,
 )
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
-from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics
+from semantic_mapper.types import CameraIntrinsics
 
 PSEUDO_LABEL, COMPUTED_DEPTH, DEPTH_SIGMA = "pseudo_label", "computed_depth", "depth_sigma"  # folders
-LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
-
-
 _OTHER_LENS = re.compile(r"dist\w+|coeffs|D|(distortion_|lens_)?model")  # keys of other programs
 
 
@@ -91,7 +85,7 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
     lens, given, metric = read_intrinsics(folder / "intrinsics.json", notices, list(color.values()))
     poses = read_pose_rows(folder / "poses.txt", color.keys())
     notices += without_picture("row of poses.txt", poses, color, folder / "color")
-    stamps = _read_stamps(folder / "timestamps.txt", max(color) + 1, notices)
+    stamps = read_stamps(folder / "timestamps.txt", max(color) + 1, DEFAULT_HZ, notices)
     depth, computed, sigma, labels, pseudo = (
         numbered_files(folder / name, suffixes, notices)
         for name, suffixes in (
@@ -109,14 +103,13 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
         notices.append("label/ is left out: labels.json, which names its classes, is missing")
     pictures: list[PosedPicture] = []
     for number, file in color.items():
-        stamp = stamps[number]
         unsure = number not in depth and number in computed and number in sigma
         pictures.append(
             PosedPicture(
                 file,
                 lens,
-                stamp if isinstance(stamp, BadFrameError) else poses[number],
-                None if isinstance(stamp, BadFrameError) else stamp,
+                poses[number],
+                stamps[number],
                 depth_file=computed[number] if unsure else depth.get(number),
                 sigma_file=sigma[number] if unsure else None,
                 label_file=labels.get(number, pseudo.get(number)),
@@ -129,45 +122,11 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
     return PosedPictures(source, pictures, options, scale, notices, metric=metric, hz=DEFAULT_HZ, labels=label_set)
 
 
-def _read_stamps(file: Path, count: int, notices: list[str]) -> Sequence[int | BadFrameError]:
-    """Of each frame its stamp, or why it is missing."""
-    if not file.exists():
-        notices.append(f"no timestamps.txt: stamps are made up at {DEFAULT_HZ:g} frames a second")
-        return [round(number * 1e9 / DEFAULT_HZ) for number in range(count)]
-    rows = [text.strip() for _, text in read_rows(file, count)]
-    if len(rows) < count:
-        raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(rows)} rows")
-    to_ns = seconds_to_ns if any(re.search(r"\d?\.|\d[eE]", row) for row in rows) else _whole_ns
-    stamps: list[int | BadFrameError] = []
-    for number, row in enumerate(rows[:count], 1):
-        try:
-            stamps.append(to_ns(row))
-        except ValueError as error:
-            stamps.append(BadFrameError(file, f"row {number}: {error}"))
-    good = [stamp for stamp in stamps if not isinstance(stamp, BadFrameError)]
-    if len(good) > 1 and 0 < np.median(np.diff(good)) < LEAST_PERIOD_NS:
-        raise ImportSourceError(
-            f"{file}: frames are {np.median(np.diff(good)):g} ns apart; whole numbers are nanoseconds: write seconds "
-            "with a point (1.0), or convert milliseconds"
-        )
-    return stamps
-
-
-def _whole_ns(row: str) -> int:
-    """Raises: ValueError: no whole number, or too large for a stamp."""
-    if not row.isdecimal() or int(row) > MAX_STAMP_NS:
-        raise ValueError(f"'{row[:40]}' is not a time from 0 to {MAX_STAMP_NS} ns; write capture times")
-    return int(row)
-
-
 def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
     """``labels.json`` -> label set; one that says nothing else is called as its folder.
 
-    Raises ImportSourceError: missing, or no label set.
-
-    Args:
-        file: To read.
-        notices: Gets a sentence on what had to be assumed of the id that means unknown.
+    ``notices`` gets a sentence on what had to be assumed of the id that means unknown. Raises ImportSourceError:
+    missing, or no label set.
     """
     labels = convert_known(read_plain_json(file), _Labels, file)
     try:
@@ -207,12 +166,8 @@ def read_intrinsics(
 ) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
     """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
 
-    Raises ImportSourceError: missing, or a value that cannot be.
-
-    Args:
-        file: To read.
-        notices: Gets a sentence on keys that are not read.
-        pictures: The first that can be read tells the size where the file does not.
+    The first of ``pictures`` that can be read tells the size where the file does not. ``notices`` gets a sentence on
+    keys that are not read. Raises ImportSourceError: missing, or a value that cannot be.
     """
     plain = read_plain_json(file)
     i = convert_known(plain, _Intrinsics, file)

@@ -42,7 +42,7 @@ from semantic_mapper.replay.importers.tables import (
     numbered_files,
     read_lines,
     read_numbers,
-    read_rows,
+    read_stamps,
     split_row,
 )
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -75,11 +75,8 @@ LABELS = _label_set()
 def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     """A drive, opened; a frame for each image of the left camera and, where they are there, of the right one.
 
+    ``folder`` is the root with one drive, or the drive's in ``data_2d_raw``; cameras are called as their folders are.
     Raises ImportSourceError: calibration, images or poses are missing or cannot be understood.
-
-    Args:
-        folder: The root with one drive, or the drive's folder in ``data_2d_raw``.
-        options: See ``ImportOptions``; cameras are called as their folders are.
     """
     notices: list[str] = []
     root, drive = find_drive(folder)
@@ -106,12 +103,10 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     pictures: list[PosedPicture] = []
     for name in cameras:
         intrinsics, T_cam0_camera = rectified[name]
-        stamps = _read_stamps(raw / name / "timestamps.txt", max(files[name]) + 1, notices)
+        stamps = read_stamps(raw / name / "timestamps.txt", max(files[name]) + 1, NOMINAL_HZ, notices)
         for number, file in files[name].items():
-            stamp, pose = stamps[number], poses.get(number)
-            if isinstance(stamp, BadFrameError):
-                pose = stamp
-            elif pose is None:
+            pose = poses.get(number)
+            if pose is None:
                 pose = BadFrameError(poses_file, f"has no pose for image {number}; the drive has poses where it moved")
             else:
                 pose = pose @ T_cam0_camera
@@ -120,7 +115,7 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
                     file,
                     intrinsics,
                     pose,
-                    None if isinstance(stamp, BadFrameError) else stamp,
+                    stamps[number],
                     depth_file=scans.get(number),
                     label_file=labels[name].get(number),
                     seq=number,
@@ -170,22 +165,6 @@ def _read_poses(file: Path, notices: list[str]) -> dict[int, Float64]:
         )
     notices += left_out_notice("pose", bad)
     return poses
-
-
-def _read_stamps(file: Path, count: int, notices: list[str]) -> list[int | BadFrameError]:
-    """Of each image below ``count`` the stamp, or why it is missing."""
-    if not file.exists():
-        notices.append(f"{file} is missing: stamps are made up at {NOMINAL_HZ:g} frames a second")
-        return [round(number * 1e9 / NOMINAL_HZ) for number in range(count)]
-    rows = read_rows(file, count)
-    stamps: list[int | BadFrameError] = []
-    for line, text in rows:  # 2013-05-28 08:46:02.904547200
-        try:
-            stamps.append(int(np.datetime64(text.strip().replace(" ", "T") or "none", "ns").astype(np.int64)))
-        except ValueError as error:
-            stamps.append(BadFrameError(file, f"line {line}: expected a date and a time: {error}"))
-    missing = [BadFrameError(file, f"has {len(rows)} rows and so no time for image {n}") for n in range(count)]
-    return [*stamps, *missing[len(rows) :]]
 
 
 def find_drive(folder: Path) -> tuple[Path, str]:

@@ -55,13 +55,12 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     place, model = _largest(folder, notices)
     roots = (folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)
     root = _root(folder, roots, [image.name for image in model.images])
-    left_out = [*model.left_out]
+    notices += left_out_notice("image", model.left_out)
 
     def picture_of(image: ColmapImage) -> PosedPicture:
         return PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
 
-    pictures = keep_good(picture_of, model.images, left_out)
-    notices += left_out_notice("image", left_out)
+    pictures = keep_good(picture_of, model.images, "image", notices)
     return _opened("colmap", folder, pictures, model.xyz, options, notices)
 
 
@@ -160,9 +159,11 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
         )
     names = sorted(model.shots, key=numeric_order)
     root = _root(folder, (file.parent / "images", folder / "images", file.parent.parent / "images"), names)
-    left_out: list[str] = []
-    pictures = keep_good(lambda name: _opensfm_picture(root, name, model, f"{file}, shot '{name}'"), names, left_out)
-    notices += left_out_notice("picture", left_out)
+
+    def picture_of(name: str) -> PosedPicture:
+        return _opensfm_picture(root, name, model, f"{file}, shot '{name}'")
+
+    pictures = keep_good(picture_of, names, "picture", notices)
     points = np.array([point.coordinates for point in model.points.values()], np.float64).reshape(-1, 3)
     origin = None
     if model.reference_lla is not None and (model.reference_lla.latitude or model.reference_lla.longitude):

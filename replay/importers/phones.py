@@ -39,7 +39,6 @@ from semantic_mapper.replay.importers.tables import (
     MAX_NORM_ERROR,
     convert_known,
     keep_good,
-    left_out_notice,
     numbered_files,
     read_plain_json,
     refuse_keys,
@@ -57,26 +56,17 @@ _RECORD3D_KNOWN = ("dw", "dh", "initPose", "cameraType")  # of the depth images,
 
 
 class _Camera(msgspec.Struct):
-    """Of Polycam."""
+    """Of Polycam, with the numbers of ``_Pose``."""
 
     fx: float
     fy: float
     cx: float
     cy: float
-    t_00: float
-    t_01: float
-    t_02: float
-    t_03: float
-    t_10: float
-    t_11: float
-    t_12: float
-    t_13: float
-    t_20: float
-    t_21: float
-    t_22: float
-    t_23: float
     width: float | None = None  # not in corrected_cameras since 2025
     height: float | None = None
+
+
+_Pose = msgspec.defstruct("_Pose", [(f"t_{i}{j}", float) for i in range(3) for j in range(4)])  # camera to world
 
 
 def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -92,7 +82,6 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
     cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
     notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
-    left_out: list[str] = []
     tables: list[dict[str, Any]] = []
 
     def picture_of(timed: tuple[int, Path]) -> PosedPicture:
@@ -103,13 +92,13 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
         c = convert_known(tables[-1], _Camera, file)
         size = (c.width, c.height) if c.width and c.height else first_size([image], file)
         intrinsics = camera_of(file, (c.fx, c.fy, c.cx - 0.5, c.cy - 0.5), size)
-        T_world_gl = np.array([[getattr(c, f"t_{i}{j}") for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]])
+        T_world_gl = np.eye(4)
+        T_world_gl[:3] = np.reshape(msgspec.structs.astuple(convert_known(tables[-1], _Pose, file)), (3, 4))
         T = T_Z_UP_Y_UP @ T_world_gl @ GL_AXES
         depth, confidence = (keyframes / name / f"{image.stem}.png" for name in ("depth", "confidence"))
         return PosedPicture(image, intrinsics, T, 1000 * (time_us - min(images)), depth, confidence)
 
-    pictures = keep_good(picture_of, images.items(), left_out)
-    notices += left_out_notice("picture", left_out, "without a camera that can be used")
+    pictures = keep_good(picture_of, images.items(), "picture", notices, "without a camera that can be used")
     notices += unknown_notice(keyframes / f"{kind}cameras", tables, _Camera, _POLYCAM_KNOWN)
     return PosedPictures(f"polycam {folder.resolve().name}", pictures, options, POLYCAM_SCALE, notices)
 
@@ -142,7 +131,6 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     if (folder / "depth").is_dir():
         notices.append("the depth images (OpenEXR) are not read; frames come without depth")
     seconds = _seconds(found, list(images), file, notices)
-    left_out: list[str] = []
 
     def picture_of(timed: tuple[tuple[int, Path], float]) -> PosedPicture:
         (number, image), second = timed
@@ -150,8 +138,7 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
             image, _record3d_intrinsics(found, number, image), _record3d_pose(found, number, image), round(second * 1e9)
         )
 
-    pictures = keep_good(picture_of, zip(images.items(), seconds, strict=True), left_out)
-    notices += left_out_notice("picture", left_out)
+    pictures = keep_good(picture_of, zip(images.items(), seconds, strict=True), "picture", notices)
     return PosedPictures(f"record3d {folder.resolve().name}", pictures, options, RECORD3D_SCALE, notices)
 
 

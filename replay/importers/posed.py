@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
-from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.errors import ConfigError, ImportSourceError, LabelError
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics
+from semantic_mapper.imaging import rotate_frame, rotate_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
@@ -45,7 +46,7 @@ class PosedPicture:
     file: Path
     intrinsics: CameraIntrinsics  # with distortion, of the picture at any size
     pose: Float64 | BadFrameError  # T_world_camera (4, 4), OpenCV's axes; or why the picture cannot be used
-    stamp_ns: int | None = None  # None = not known
+    stamp_ns: int | BadFrameError | None = None  # None = not known; or why the picture cannot be used
     depth_file: Path | None = None  # 16-bit PNG or NumPy's file, of any size with the same view
     confidence_file: Path | None = None  # 8-bit PNG of its size, whose 0 means that the depth is not to be trusted
     sigma_file: Path | None = None  # the depth is computed, and this is its one-sigma spread
@@ -54,6 +55,11 @@ class PosedPicture:
     view: CameraIntrinsics | None = None  # a camera at the same place, to whose pixels, as depth has, all is brought
     seq: int | None = None  # number of the frame in the log; None = its place in the recording
     camera_id: str = CAMERA_ID  # in the log
+
+    @property
+    def fault(self) -> BadFrameError | None:
+        """Why it cannot be used."""
+        return next((found for found in (self.pose, self.stamp_ns) if isinstance(found, BadFrameError)), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +74,7 @@ class LoadedFrame:
 class PosedPictures:
     """The pictures of a recording; ``load`` may be called in any order.
 
-    Raises ImportSourceError: there is no picture.
+    Raises ImportSourceError: there is no picture. LabelError: a class to rename that the recording does not have.
 
     Args:
         source: What the log names as its source.
@@ -118,9 +124,15 @@ class PosedPictures:
             picture.camera_id: self._rectifier(picture.view or picture.intrinsics, picture.file).intrinsics
             for picture in {picture.camera_id: picture for picture in reversed(self._pictures)}.values()
         }
+        self._labels, self._new_ids = labels, np.arange(256, dtype=np.uint8)
+        if options.renames:
+            if labels is None:
+                raise LabelError(f"{source}: there are no classes to rename, it has no labels")
+            labels, self._new_ids = labels.renamed(options.renames)
+        self._quarters = options.quarters
         self.info = StreamInfo(
             source=source,
-            cameras=dict(sorted(cameras.items())),
+            cameras={name: rotate_intrinsics(k, self._quarters) for name, k in sorted(cameras.items())},
             label_set=labels,
             frame_hz=hz,
             metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
@@ -132,8 +144,9 @@ class PosedPictures:
     def load(self, number: int) -> LoadedFrame:
         """Read one frame. Raises BadFrameError: it cannot be used."""
         picture = self._pictures[number]
-        if isinstance(picture.pose, BadFrameError):
-            raise picture.pose
+        if picture.fault is not None:
+            raise picture.fault
+        assert not isinstance(picture.pose, BadFrameError)
         pose = picture.pose.copy()
         pose[:3, 3] *= self._factor
         check_frame_pose(pose, picture.file)
@@ -142,9 +155,9 @@ class PosedPictures:
         own = _at_size(picture, size)
         lens = self._rectifier(picture.view or own, picture.file)
         label, label_error = None, None
-        if picture.label_file is not None and self.info.label_set is not None:
+        if picture.label_file is not None and self._labels is not None:
             try:
-                label = self._read_label(picture.label_file, self.info.label_set, size)
+                label = self._read_label(picture.label_file, self._labels, size)
             except BadFrameError as error:
                 label_error = error
         changed = own.distorted or own != (picture.view or own)
@@ -167,13 +180,14 @@ class PosedPictures:
             camera_id=picture.camera_id,
             rgb=rgb,
             depth_m=depth,
-            label=None if label is None else lens.nearest(label),
+            label=None if label is None else self._new_ids[lens.nearest(label)],
             intrinsics=lens.intrinsics,
             T_world_camera=pose,
             depth_sigma_m=sigma,
             label_is_pseudo=picture.pseudo_label and label is not None,
         )
-        return LoadedFrame(frame, None if changed else encoded, label_error)
+        unchanged = None if changed or self._quarters % 4 else encoded
+        return LoadedFrame(rotate_frame(frame, self._quarters), unchanged, label_error)
 
     def _depth(self, file: Path, lens: Rectifier, rgb: UInt8, confidence: Path | None = None) -> Float32:
         """Depth, or its spread, (H, W) in metres, in the pixels of the rectified picture."""
@@ -245,7 +259,7 @@ def _once_each(pictures: Sequence[PosedPicture], notices: list[str]) -> list[Pos
 
 def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) -> tuple[list[PosedPicture], list[int]]:
     """The pictures in the order of their times and their stamps, which are made up where not each has a time."""
-    usable = [picture for picture in pictures if not isinstance(picture.pose, BadFrameError)]
+    usable = [picture for picture in pictures if picture.fault is None]
     missing = sum(picture.stamp_ns is None for picture in usable)
     if missing:
         why = "there are no times" if missing == len(usable) else f"{missing} of {len(usable)} pictures have no time"
@@ -253,7 +267,7 @@ def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) ->
         return list(pictures), [round(number * 1e9 / hz) for number in range(len(pictures))]
     times: list[int] = []
     for picture in pictures:  # those that cannot be used stay behind the one before them
-        times.append(picture.stamp_ns if picture.stamp_ns is not None else (times or [0])[-1])
+        times.append(picture.stamp_ns if isinstance(picture.stamp_ns, int) else (times or [0])[-1])
     order = sorted(range(len(times)), key=times.__getitem__)
     if order != list(range(len(times))):
         notices.append("the times of the pictures go back; pictures are sorted by them")
@@ -262,7 +276,7 @@ def _in_time(pictures: Sequence[PosedPicture], hz: float, notices: list[str]) ->
     for number in order:
         camera = pictures[number].camera_id
         stamps_ns.append(max(times[number], last.get(camera, -SHIFT_NS) + SHIFT_NS))
-        if not isinstance(pictures[number].pose, BadFrameError):
+        if pictures[number].fault is None:
             last[camera] = stamps_ns[-1]
     shifted = sum(stamp != times[number] for stamp, number in zip(stamps_ns, order, strict=True))
     if shifted:

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
-
-from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
-from semantic_mapper.imaging import rotate_frame, rotate_intrinsics
+from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, read_note
-from semantic_mapper.replay.importers.base import (
-    BadFrameError,
-    ImportOptions,
-    ImportReport,
-    Skipped,
-    read_bytes,
-)
+from semantic_mapper.replay.importers.base import BadFrameError, ImportOptions, ImportReport, Skipped, read_bytes
 from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.importers.kitti360 import open_kitti360
 from semantic_mapper.replay.importers.models import find_opensfm, open_colmap, open_opensfm
@@ -34,8 +24,6 @@ from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap import find_models
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import PosedFrame
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
     "folder": open_folder,
@@ -172,7 +160,6 @@ def import_recording(
     on_progress: Callable[[int, int], None] | None = None,
     *,
     options: ImportOptions = _DEFAULTS,
-    renames: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> ImportReport:
     """Write the recording ``src`` (folder or ROS bag) to the log ``dst``, which is there once the import is complete.
@@ -188,7 +175,6 @@ def import_recording(
         format_name: One of ``FORMATS``; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
-        renames: New names of classes by their present ones; classes of one name become one class.
         overwrite: Whether a log that is there may be replaced.
     """
     if dst.exists() and not overwrite:
@@ -202,11 +188,10 @@ def import_recording(
         raise ImportSourceError(f"{src}: no such folder")
     recording = FORMATS[name](src, options)
     numbers = range(0, len(recording), options.every)[: options.max_frames]
-    info, changed = _changes(src, recording.info, options, renames or {})
-    report = ImportReport(name, recording.depth_scale, info, notices=recording.notices)
+    report = ImportReport(name, recording.depth_scale, recording.info, notices=recording.notices)
     pseudo_labelled = computed = 0
     packing = CodecOptions(depth_scale=recording.depth_scale.units_per_m)
-    with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
+    with atomic_log(dst, recording.info, options=packing, overwrite=overwrite) as writer:
         if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
             # Who rendered its pseudo labels, and from which frames' labels: these must not be scored.
             note = LogAttachment(AUTOLABEL_ATTACHMENT, "application/json", read_bytes(src / AUTOLABEL_ATTACHMENT))
@@ -216,16 +201,15 @@ def import_recording(
         for done, number in enumerate(numbers, 1):
             try:
                 loaded = recording.load(number)
-                frame = changed(loaded.frame)
-                writer.write_frame(frame, encoded_rgb=None if options.quarters % 4 else loaded.encoded_rgb)
+                writer.write_frame(loaded.frame, encoded_rgb=loaded.encoded_rgb)
             except BadFrameError as error:
                 report.skipped.append(Skipped(error.file, error.reason, number))
             except (FrameError, CodecError) as error:
                 report.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
             else:
-                report.count(frame)
-                pseudo_labelled += frame.label_is_pseudo
-                computed += frame.depth_sigma_m is not None
+                report.count(loaded.frame)
+                pseudo_labelled += loaded.frame.label_is_pseudo
+                computed += loaded.frame.depth_sigma_m is not None
                 if (bad := loaded.label_error) is not None:
                     report.skipped.append(Skipped(bad.file, bad.reason, number, label_only=True))
             if on_progress is not None:
@@ -239,22 +223,3 @@ def import_recording(
             report.notices.append(f"{counted(count, 'frame')} with {what}; marked in the log")
     report.bytes = dst.stat().st_size
     return report
-
-
-def _changes(
-    src: Path, info: StreamInfo, options: ImportOptions, renames: Mapping[str, str]
-) -> tuple[StreamInfo, Callable[[PosedFrame], PosedFrame]]:
-    """What the log says of its frames, and what makes its frames of those of the recording."""
-    cameras = {camera: rotate_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
-    info = msgspec.structs.replace(info, cameras=cameras)
-    if not renames:
-        return info, lambda frame: rotate_frame(frame, options.quarters)
-    if info.label_set is None:
-        raise LabelError(f"{src}: there are no classes to rename, it has no labels")
-    label_set, new_ids = info.label_set.renamed(renames)
-
-    def changed(frame: PosedFrame) -> PosedFrame:
-        turned = rotate_frame(frame, options.quarters)
-        return turned if turned.label is None else dataclasses.replace(turned, label=new_ids[turned.label])
-
-    return msgspec.structs.replace(info, label_set=label_set), changed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -12,14 +13,15 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 
-from semantic_mapper.errors import ConfigError, ImportSourceError
-from semantic_mapper.files import decode_text, read_regular
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.files import decode_text
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import BadFrameError, check_frame_pose, read_bytes
 from semantic_mapper.types import MAX_STAMP_NS, Float64
 
 MAX_JSON_BYTES = 1 << 30  # hours of frames
 MAX_NORM_ERROR = 0.1  # of a unit quaternion: files have few digits, and are normalised; more is no rotation
+LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
 _NUMBER_LENGTH = 100  # letters
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
@@ -30,12 +32,8 @@ MadeT = TypeVar("MadeT")
 def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) -> dict[int, Path]:
     """Files named by a number ("000017.jpg", "17.png", "frame-000017.color.jpg") by that number, in its order.
 
-    Of several numbers the first one counts, unless the last one tells more files apart ("cam0_000017.png").
-
-    Args:
-        folder: Of the files; none are found where it is missing.
-        suffixes: What their names end with, in small letters.
-        notices: Gets a sentence on files that are left out.
+    Of several numbers the first one counts, unless the last one tells more files apart ("cam0_000017.png"). ``notices``
+    gets a sentence on files that are left out. A folder that is missing has none.
     """
     found: dict[int, Path] = {}
     left_out: list[str] = []
@@ -53,28 +51,30 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) 
 
 def left_out_notice(kind: str, left_out: Sequence[str], why: str = "") -> list[str]:
     """A sentence on things that are left out, with the first of them; empty without any."""
-    if not left_out:
-        return []
-    return [f"{counted(len(left_out), kind)} left out{', ' + why if why else ''}; the first: {left_out[0]}"]
+    what = f"{counted(len(left_out), kind)} left out{', ' + why if why else ''}"
+    return [f"{what}; the first: {left_out[0]}"] if left_out else []
 
 
-def keep_good(make: Callable[[ItemT], MadeT], items: Iterable[ItemT], left_out: list[str]) -> list[MadeT]:
-    """What is made of each item; of those that cannot be used, ``left_out`` gets the reason."""
+def keep_good(
+    make: Callable[[ItemT], MadeT], items: Iterable[ItemT], kind: str, notices: list[str], why: str = ""
+) -> list[MadeT]:
+    """What is made of each item; ``notices`` gets a sentence on those that cannot be used, as ``left_out_notice``."""
     made: list[MadeT] = []
+    left_out: list[str] = []
     for item in items:
         try:
             made.append(make(item))
         except ImportSourceError as error:
             left_out.append(str(error))
+    notices += left_out_notice(kind, left_out, why)
     return made
 
 
 def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], where: Path) -> list[str]:
     """A sentence on poses or the like whose picture is missing; empty where all are there."""
     missing = sorted({*numbers} - {*pictures})
-    if not missing:
-        return []
-    return [f"{counted(len(missing), kind)} without a picture in {where}; the first: number {missing[0]}"]
+    what = f"{counted(len(missing), kind)} without a picture in {where}"
+    return [f"{what}; the first: number {missing[0]}"] if missing else []
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -186,17 +186,56 @@ def seconds_to_ns(text: str) -> int:
 
     Raises ValueError: no number, or too large for a stamp.
     """
-    try:
-        seconds = Decimal(text.strip()) if len(text) <= _NUMBER_LENGTH else None
-    except InvalidOperation:
-        seconds = None
-    if seconds is None or not seconds.is_finite() or seconds < 0:
-        raise ValueError(f"'{text[:40]}' is not a time in seconds")
-    if seconds >= MAX_STAMP_NS // 1_000_000_000:
-        raise ValueError(
-            f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000}); divide nanoseconds by 1e9"
+    with suppress(InvalidOperation):  # of what is no number, and of NaN when it is compared
+        seconds = Decimal(text.strip() if len(text) <= _NUMBER_LENGTH else "NaN")
+        if 0 <= seconds < MAX_STAMP_NS // 1_000_000_000:
+            return int(seconds.scaleb(9))
+    raise ValueError(
+        f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000}); divide nanoseconds by 1e9"
+    )
+
+
+def read_stamps(file: Path, count: int, hz: float, notices: list[str]) -> Sequence[int | BadFrameError]:
+    """Stamps of ``count`` images by a file whose i-th row belongs to image i; made up at ``hz`` where it is missing.
+
+    Rows hold nanoseconds, or all of them seconds (with a point), or date and time. Raises ImportSourceError: fewer rows
+    than images, or times that cannot be in nanoseconds.
+
+    Returns:
+        Of each image the stamp in nanoseconds, or why it has none.
+    """
+    if not file.exists():
+        notices.append(f"no {file}: stamps are made up at {hz:g} frames a second")
+        return [round(number * 1e9 / hz) for number in range(count)]
+    rows = [(line, text.strip()) for line, text in read_rows(file, count)]
+    if len(rows) < count:
+        raise ImportSourceError(f"{file}: needs a stamp for each of {count} frames, has {len(rows)} rows")
+    forms = ((r":", _date_to_ns), (r"\.|\d[eE]", seconds_to_ns), (r"", _whole_ns))
+    to_ns = next(to_ns for form, to_ns in forms if any(re.search(form, text) for _, text in rows))
+    stamps: list[int | BadFrameError] = []
+    for line, text in rows[:count]:
+        try:
+            stamps.append(to_ns(text))
+        except ValueError as error:
+            stamps.append(BadFrameError(file, f"line {line}: {error}"))
+    good = [stamp for stamp in stamps if not isinstance(stamp, BadFrameError)]
+    if len(good) > 1 and 0 < np.median(np.diff(good)) < LEAST_PERIOD_NS:
+        raise ImportSourceError(
+            f"{file}: frames are {np.median(np.diff(good)):g} ns apart; whole numbers are nanoseconds: write seconds "
+            "with a point (1.0), or convert milliseconds"
         )
-    return int(seconds.scaleb(9))
+    return stamps
+
+
+def _date_to_ns(text: str) -> int:
+    """Of 2013-05-28 08:46:02.904547200, say."""
+    return int(np.datetime64(text.replace(" ", "T") or "none", "ns").astype(np.int64))
+
+
+def _whole_ns(text: str) -> int:
+    if not text.isdecimal() or int(text) > MAX_STAMP_NS:
+        raise ValueError(f"'{text[:40]}' is not a time from 0 to {MAX_STAMP_NS} ns; write capture times")
+    return int(text)
 
 
 def read_plain_json(file: Path, kind: type[Any] = dict) -> Any:
@@ -205,11 +244,7 @@ def read_plain_json(file: Path, kind: type[Any] = dict) -> Any:
     Raises ImportSourceError: missing, no JSON, or too large.
     """
     try:
-        plain = json.loads(decode_text(read_regular(file, MAX_JSON_BYTES)), parse_constant=lambda _: None)
-    except ConfigError as error:
-        raise ImportSourceError(str(error)) from error
-    except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+        plain = json.loads(decode_text(read_bytes(file, MAX_JSON_BYTES)), parse_constant=lambda _: None)
     except (ValueError, RecursionError) as error:
         raise ImportSourceError(f"{file}: not valid JSON: {error}") from error
     if not isinstance(plain, kind):
@@ -245,11 +280,7 @@ def unknown_notice(
 ) -> list[str]:
     """A sentence on keys that nothing here reads although they change what other numbers mean; empty without any.
 
-    Args:
-        file: Of the tables.
-        tables: Of one kind, such as the frames of a recording.
-        kind: What is read of them.
-        known: Further keys that are known to change nothing.
+    The tables are of one kind, such as the frames of a recording; ``known`` are keys that are known to change nothing.
     """
     read = {*(item.encode_name for item in msgspec.structs.fields(kind)), *known}
     found: set[str] = set()

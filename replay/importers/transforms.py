@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -32,12 +32,11 @@ from semantic_mapper.replay.importers.tables import (
     convert_known,
     inside,
     keep_good,
-    left_out_notice,
     read_plain_json,
     refuse_keys,
     unknown_notice,
 )
-from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics
 
 FILE = "transforms.json"
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # Blender's data sets leave them out
@@ -51,6 +50,16 @@ _REFUSED = re.compile(
 )
 _OUR_AXES = ("opengl", "blender", "nerf", "nerfstudio", "arkit")
 _BELIEVABLE_S = (1e-3, 10.0)  # between two frames
+_FOCAL = (
+    "fl_x",
+    "fl_y",
+    "camera_angle_x",
+    "camera_angle_y",
+    "x_fov",
+    "y_fov",
+)  # a frame's own stand for all of the file's
+_Row = tuple[float, float, float, float]
+_Matrix = Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
 
 
 class _Lens(msgspec.Struct, kw_only=True):
@@ -80,7 +89,7 @@ class _Lens(msgspec.Struct, kw_only=True):
 
 class _Frame(_Lens, kw_only=True):
     file_path: str
-    transform_matrix: list[list[float]] | None = None
+    transform_matrix: _Matrix
     depth_file_path: str | None = None
     depth_path: str | None = None
     timestamp: float | str | None = None  # in a unit that nothing tells
@@ -91,7 +100,7 @@ class _Transforms(_Lens, kw_only=True):
     depth_unit_scale_factor: float | None = None
     integer_depth_scale: float | None = None
     applied_scale: float | None = None  # of nerfstudio: what poses were multiplied by
-    applied_transform: list[list[float]] | None = None  # what they were moved by
+    applied_transform: _Matrix | None = None  # what they were moved by
 
 
 def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -104,30 +113,32 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     found = convert_known(plain, _Transforms, file)
     refuse_keys(plain, _REFUSED, file)
     notices = unknown_notice(file, [plain], _Transforms, _NEUTRAL) + unknown_notice(file, found.frames, _Frame)
-    left_out: list[str] = []
+    shared = {name: value for name in _Lens.__struct_fields__ if (value := getattr(found, name)) is not None}
 
     def read_frame(numbered: tuple[int, dict[str, Any]]) -> tuple[_Frame, Path]:
         where = f"{file}, frame {numbered[0]}"
         refuse_keys(numbered[1], _REFUSED, where)
-        frame = convert_known(numbered[1], _Frame, where)
+        own = {key: value for key, value in numbered[1].items() if value is not None}
+        of_all = {key: shared[key] for key in shared if key not in _FOCAL or not any(own.get(name) for name in _FOCAL)}
+        frame = convert_known(of_all | own, _Frame, where)
         return frame, _image(folder, frame.file_path)
 
-    read = keep_good(read_frame, enumerate(found.frames), left_out)
+    read = keep_good(read_frame, enumerate(found.frames), "frame", notices)
     frames = [frame for frame, _ in read]
-    if read and (found.w is None or found.h is None):
-        found.w, found.h = first_size((image for _, image in read), folder)
+    size = (0.0, 0.0) if (found.w and found.h) or not read else first_size((image for _, image in read), folder)
     stamps_ns = _stamps([_time(frame) for frame in frames], file, notices)
     factor = _metres_per_unit(found, file, notices) if options.scale is None else 1.0
 
     def picture_of(stamped: tuple[tuple[_Frame, Path], int | None]) -> PosedPicture:
         (frame, image), stamp_ns = stamped
-        lens, pose = _intrinsics(found, frame, image), _pose(frame.transform_matrix, image)
-        pose[:3, 3] *= factor
+        T = np.eye(4)
+        T[: len(frame.transform_matrix)] = frame.transform_matrix
+        T[:3, 3] *= factor
+        lens = _intrinsics(frame, (frame.w or size[0], frame.h or size[1]), image)
         depth = frame.depth_file_path or frame.depth_path
-        return PosedPicture(image, lens, pose, stamp_ns, inside(folder, depth) if depth else None)
+        return PosedPicture(image, lens, T @ GL_AXES, stamp_ns, inside(folder, depth) if depth else None)
 
-    pictures = keep_good(picture_of, zip(read, stamps_ns, strict=True), left_out)
-    notices += left_out_notice("frame", left_out)
+    pictures = keep_good(picture_of, zip(read, stamps_ns, strict=True), "frame", notices)
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
     scale = _depth_scale(file, found, frames, options, factor)
     has_sensor = any(frame.depth_file_path for frame in frames) and not options.without_depth
@@ -168,11 +179,7 @@ def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> floa
     """What makes positions those that they were before nerfstudio has scaled them."""
     scale = found.applied_scale or 1.0
     if found.applied_transform is not None:
-        try:
-            determinant = float(np.linalg.det(np.array(found.applied_transform, np.float64)[:3, :3]))
-        except (ValueError, IndexError, np.linalg.LinAlgError):
-            determinant = 0.0
-        scale *= float(np.cbrt(determinant))
+        scale *= float(np.cbrt(np.linalg.det(np.array(found.applied_transform)[:3, :3])))
     if not 1e-6 < scale < 1e6:
         raise ImportSourceError(f"{file}: a scale of {scale:g} (applied_scale, applied_transform) cannot be")
     if abs(scale - 1) < 1e-6:
@@ -206,53 +213,27 @@ def _stamps(times: Sequence[float | None], file: Path, notices: list[str]) -> li
     return [None if t is None or t * unit_ns >= MAX_STAMP_NS else round(t * unit_ns) for t in times]
 
 
-def _pose(rows: list[list[float]] | None, image: Path) -> Float64:
-    """``T_world_camera`` (4, 4)."""
-    try:
-        T = np.array(rows if rows is not None else [], np.float64)
-    except ValueError:
-        T = np.zeros(0)
-    if T.shape == (3, 4):
-        T = np.vstack((T, (0, 0, 0, 1)))
-    if T.shape != (4, 4):
-        raise BadFrameError(image, "has no transform_matrix of 4x4 numbers")
-    return T @ GL_AXES
-
-
-def _intrinsics(of_all: _Lens, frame: _Frame, image: Path) -> CameraIntrinsics:
-    own, shared = _given(frame), _given(of_all)
-    k: dict[str, Any] = {**shared, **own}
-    (fx, fy), (all_fx, all_fy) = _focals(own, k), _focals(shared, k)
-    fx, fy = (fx, fy) if fx or fy else (all_fx, all_fy)
+def _intrinsics(k: _Frame, size: tuple[float, float], image: Path) -> CameraIntrinsics:
+    fx = k.fl_x or _focal(k.camera_angle_x, k.x_fov, size[0])
+    fy = k.fl_y or _focal(k.camera_angle_y, k.y_fov, size[1])
     fx, fy = fx or fy, fy or fx
-    if fx is None or fy is None:
+    if not fx or not fy:
         raise BadFrameError(image, "has no focal length: fl_x, or camera_angle_x")
-    model = k.get("camera_model", "OPENCV")
+    model = k.camera_model or "OPENCV"
     lens, other = ("k1", "k2", "p1", "p2", "k3"), ("k4", "k5", "k6")
-    if k.get("is_fisheye") or is_fisheye_model(model):
+    if k.is_fisheye or is_fisheye_model(model):
         model, lens, other = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4"), ("p1", "p2", "k5", "k6")
-    strange = [name for name in other if k.get(name)]
+    strange = [name for name in other if getattr(k, name)]
     if strange:
         raise BadFrameError(
             image,
             f"camera_model '{model}' has no {', '.join(strange)} that programs agree on; undistort the images first",
         )
-    centre = k.get("cx", k["w"] / 2) - 0.5, k.get("cy", k["h"] / 2) - 0.5
-    return camera_of(image, (fx, fy, *centre), (k["w"], k["h"]), model, [k.get(name, 0.0) for name in lens])
+    cx, cy = (side / 2 if c is None else c for side, c in zip(size, (k.cx, k.cy), strict=True))
+    coefficients = [getattr(k, name) or 0.0 for name in lens]
+    return camera_of(image, (fx, fy, cx - 0.5, cy - 0.5), size, model, coefficients)
 
 
-def _given(lens: _Lens) -> dict[str, Any]:
-    values = {name: getattr(lens, name) for name in _Lens.__struct_fields__}
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def _focals(lens: Mapping[str, Any], k: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """fx and fy of what a frame, or the file, says of them."""
-
-    def focal(name: str, side: float) -> float | None:
-        if lens.get(f"fl_{name}"):
-            return lens[f"fl_{name}"]
-        angle = lens.get(f"camera_angle_{name}", math.radians(lens.get(f"{name}_fov", 0.0)))
-        return side / 2 / math.tan(angle / 2) if 0 < angle < math.pi else None
-
-    return focal("x", k["w"]), focal("y", k["h"])
+def _focal(angle: float | None, fov_deg: float | None, side: float) -> float | None:
+    angle = math.radians(fov_deg or 0.0) if angle is None else angle
+    return side / 2 / math.tan(angle / 2) if 0 < angle < math.pi else None

@@ -34,6 +34,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "opensfm": lambda folder: rec.make_opensfm(folder, rec.flight(4)),
 }
 SPARSE = "sparse/0/"
+EYE = np.eye(4).tolist()
 REPLICA = "room_0/Sequence_1/"
 POSES = f"data_poses/{DRIVE}/cam0_to_world.txt"
 
@@ -142,7 +143,7 @@ STOPS: list[tuple[str, Edit, str]] = [
     ("transforms", keys("transforms.json", fl_x=None, fl_y=None), "no focal length"),
     ("transforms", keys("transforms.json", units="furlong"), "'units' is not read"),
     ("transforms", keys("transforms.json", frames=3), "frames"),
-    ("transforms", keys("transforms.json", frames=[{"file_path": "../a.png"}]), "outside"),
+    ("transforms", keys("transforms.json", frames=[{"file_path": "../a.png", "transform_matrix": EYE}]), "outside"),
     ("depth", images("depths", WIDE), "another form.*--topic depth=none"),
     ("colmap", write(SPARSE + "cameras.txt", "1 FOV 64 48 50 50 32 24 0.9\n"), "lens model 'FOV' is not read"),
     ("colmap", text(SPARSE + "cameras.txt", "\n1 ", "\n2 "), "pycolmap ended"),
@@ -162,7 +163,7 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("folder", row("poses.txt", 3, ""), 5, "line 4: is empty or a comment"),
     ("folder", row("poses.txt", 3, "# lost"), 5, "line 4: is empty or a comment"),
     ("folder", text("poses.txt", "\n", "\n\n"), 6, ""),
-    ("folder", write("timestamps.txt", "1.0\n1.5\nnan\n2.5\n3.0\n3.5\n"), 5, "row 3: 'nan' is not a time"),
+    ("folder", write("timestamps.txt", "1.0\n1.5\nnan\n2.5\n3.0\n3.5\n"), 5, "line 3: 'nan' is not a time"),
     ("folder", write("timestamps.txt", "timestamp\n1.0\n1.5\n2\n2.5\n3e0\n3.5\n"), 6, ""),
     ("folder", write("timestamps.txt", "1.0\n1.5\n0.5\n2.5\n3.0\n3.0\n"), 6, "go back; pictures are sorted"),
     ("folder", keys("intrinsics.json", width=None, height=None, distortion=None), 6, ""),
@@ -178,7 +179,7 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("replica", remove("../habitat/info_semantic.json"), 3, "info_semantic.json, which names its classes"),
     ("kitti360", remove(f"data_2d_raw/{DRIVE}/image_01/timestamps.txt"), 4, "stamps are made up at 10 frames"),
     ("transforms", remove("images/frame_00002.png"), 2, "cannot be read"),
-    ("transforms", frame(transform_matrix=None), 2, "has no transform_matrix"),
+    ("transforms", frame(transform_matrix=None), 2, "required field `transform_matrix`"),
     ("transforms", frame(fl_x="wide"), 2, "1 frame left out"),
     ("transforms", frame(file_path="images/frame_00001.png"), 2, "1 picture left out, which are there twice"),
     ("transforms", frame(timestamp=3.0), 3, "2 of 3 pictures have no time: stamps are made up"),

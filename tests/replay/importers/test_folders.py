@@ -333,7 +333,7 @@ def test_raw_scannet_ids_need_the_table_of_the_data_set(scannet: Path) -> None:
 
 def test_classes_are_renamed_and_joined_on_the_way_in(folder: Path) -> None:
     dst = folder.parent / "log.mcap"
-    report = import_recording(folder, dst, renames={"floor": "ground", "chair": "ground"})
+    report = import_recording(folder, dst, options=ImportOptions(renames={"floor": "ground", "chair": "ground"}))
     assert report.frames == report.labelled == 6
     log = LogReader(dst)
     assert log.info.label_set is not None
