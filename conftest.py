@@ -53,17 +53,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def redkitchen(shared_data: Path) -> Path:
     """Sequence folder of the hand-held kitchen recording: 200 frames, 640x480, labels and a labelled mesh."""
-    return _recording(shared_data, "redkitchen")
-
-
-@pytest.fixture(scope="session")
-def adt_apartment(shared_data: Path) -> Path:
-    """Sequence folder of six views with ground-truth depth and labels, 640x640."""
-    return _recording(shared_data, "adt_apartment")
-
-
-def _recording(shared_data: Path, name: str) -> Path:
-    folder = shared_data / name
+    folder = shared_data / "redkitchen"
     if not folder.is_dir():
-        pytest.skip(f"no recording '{name}' in {shared_data}")
+        pytest.skip(f"no recording '{folder.name}' in {shared_data}")
     return folder

@@ -17,15 +17,9 @@ from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.importers import (
-    FORMATS,
-    ImportOptions,
-    ImportReport,
-    RenameConfig,
-    import_recording,
-    is_recording,
-)
+from semantic_mapper.replay.importers.base import ImportOptions, ImportReport, RenameConfig
 from semantic_mapper.replay.importers.ros_bags import is_bag
+from semantic_mapper.replay.importers.run import FORMATS, import_recording, is_recording
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of

@@ -23,14 +23,7 @@ from msgspec import Meta
 
 from semantic_mapper.errors import ImportSourceError, LabelError
 from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
-from semantic_mapper.replay.importers.base import (
-    DEPTHS,
-    PICTURES,
-    DepthScale,
-    ImportOptions,
-    camera_of,
-    first_size,
-)
+from semantic_mapper.replay.importers.base import DEPTHS, PICTURES, DepthScale, ImportOptions, camera_of, first_size
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import (
     convert_known,

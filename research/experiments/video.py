@@ -34,7 +34,7 @@ from research.scenes.shots import sequence_shots
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import interpolate_pose, transform
 from semantic_mapper.plots import write_picture
-from semantic_mapper.replay.importers import ImportOptions
+from semantic_mapper.replay.importers.base import ImportOptions
 from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.geometry import invert_pose, look_at
 from semantic_mapper.labels import NYU40
-from semantic_mapper.replay.importers import ImportOptions, ImportReport, import_recording
+from semantic_mapper.replay.importers.base import ImportOptions, ImportReport
+from semantic_mapper.replay.importers.run import import_recording
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.gps import GpsPosition, east_north_up
 from semantic_mapper.types import Float64, PosedFrame

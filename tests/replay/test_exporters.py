@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.exporters import LogExportReport, export_log, log_format_of
-from semantic_mapper.replay.importers import import_recording
+from semantic_mapper.replay.importers.run import import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.run_folder import is_log

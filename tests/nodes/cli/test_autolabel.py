@@ -21,7 +21,7 @@ from semantic_mapper.nodes.cli.labelling import choose_keyframes
 from semantic_mapper.replay.autolabel import AutolabelReport, AutolabelRequest, autolabel_log
 from semantic_mapper.replay.autolabel_note import AutolabelNote, read_note
 from semantic_mapper.replay.exporters import export_log
-from semantic_mapper.replay.importers import import_recording
+from semantic_mapper.replay.importers.run import import_recording
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.jobs import OFFLINE
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter

@@ -16,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.importers import ImportOptions, ImportReport, detect_format, import_recording
 from semantic_mapper.replay.importers.ros_transforms import Track
+from semantic_mapper.replay.importers.run import detect_format
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.replay import bags
 from tests.replay.bags import CAMERA, COLOR, DEPTH, DEPTH_INFO, INFO, Event, Kind, Messages
+from tests.replay.recordings import imported, said
 from tests.small import tiny_frames
 
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite3", "mcap")
@@ -42,19 +43,8 @@ def make(
     return bags.write_bag(folder / "bag", kind, change(m, bags.room_events(m, frames)))
 
 
-def imported(src: Path, **options: Any) -> tuple[ImportReport, list[PosedFrame]]:
-    dst = src.parent / "log.mcap"
-    report = import_recording(src, dst, options=ImportOptions(**options), overwrite=True)
-    with LogReader(dst) as log:
-        return report, list(log)
-
-
 def without(*topics: str) -> Change:
     return lambda _, events: [event for event in events if event[0] not in topics]
-
-
-def notice(report: ImportReport, words: str) -> bool:
-    return any(words in text for text in report.notices)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -63,7 +53,7 @@ def test_a_bag_of_either_version_gives_the_same_pictures_depth_and_poses(tmp_pat
     assert detect_format(src) == "rosbag"
     report, frames = imported(src)
     assert (report.format, report.frames, report.with_depth, report.skipped) == ("rosbag", 6, 6, [])
-    assert report.info.frame_hz == 10.0 and notice(report, f"poses are those of {CAMERA} in map, from tf")
+    assert report.info.frame_hz == 10.0 and f"poses are those of {CAMERA} in map, from tf" in said(report)
     for n, (frame, truth) in enumerate(zip(frames, FRAMES, strict=True)):
         assert frame.stamp_ns == bags.stamp_of(n) and frame.intrinsics == truth.intrinsics
         assert np.array_equal(frame.rgb, truth.rgb)
@@ -73,20 +63,17 @@ def test_a_bag_of_either_version_gives_the_same_pictures_depth_and_poses(tmp_pat
 
 
 def test_poses_between_two_transforms_are_interpolated_and_beyond_them_there_are_none(tmp_path: Path) -> None:
-    def change(m: Messages, events: list[Event]) -> list[Event]:
-        """Odometry turns and moves evenly, and is told 30 ms off the images; the last image comes after its end."""
-        kept = without("/tf")(m, events)
-        for k in range(-1, 6):
-            ns = bags.START_NS + k * bags.PERIOD_NS + 30_000_000
-            kept.append(("/tf", ns, m.tf(ns, "odom", "base_link", even(ns))))
-        return kept
-
     def even(ns: int) -> np.ndarray:
         s = (ns - bags.START_NS) / 1e9
         T = np.eye(4)
         T[:2, :2] = ((np.cos(0.7 * s), -np.sin(0.7 * s)), (np.sin(0.7 * s), np.cos(0.7 * s)))
         T[:3, 3] = (0.5 * s, -0.1 * s, 0)
         return T
+
+    def change(m: Messages, events: list[Event]) -> list[Event]:
+        """Odometry turns and moves evenly, and is told 30 ms off the images; the last image comes after its end."""
+        times = [bags.stamp_of(k) + 30 * MS for k in range(-1, 6)]
+        return [*without("/tf")(m, events), *(("/tf", ns, m.tf(ns, "odom", "base_link", even(ns))) for ns in times)]
 
     src = make(tmp_path, "ros1", change, tiny_frames(7))
     report, frames = imported(src)
@@ -106,10 +93,8 @@ def test_over_a_long_gap_of_tf_nothing_is_interpolated(tmp_path: Path) -> None:
 
 def test_poses_that_do_not_say_whose_they_are_need_a_body(tmp_path: Path) -> None:
     def change(m: Messages, events: list[Event]) -> list[Event]:
-        kept = [event for event in events if not event[0].startswith("/tf")]
-        for n, frame in enumerate(FRAMES):
-            kept.append(("/mocap", bags.stamp_of(n), m.pose_stamped(bags.stamp_of(n), frame.T_world_camera)))
-        return kept
+        poses = [(bags.stamp_of(n), frame.T_world_camera) for n, frame in enumerate(FRAMES)]
+        return [*without("/tf", "/tf_static")(m, events), *(("/mocap", ns, m.pose_stamped(ns, T)) for ns, T in poses)]
 
     src = make(tmp_path, "mcap", change)
     with pytest.raises(ImportSourceError, match=rf"/mocap does not say whose poses.*--body {CAMERA}"):
@@ -233,16 +218,14 @@ def test_depth_of_another_camera_is_registered_by_tf(tmp_path: Path) -> None:
     depth[:, 30:] = 1500
 
     def change(m: Messages, events: list[Event]) -> list[Event]:
-        kept = without(DEPTH, DEPTH_INFO)(m, events)
-        kept.append(("/tf_static", bags.START_NS + 1, m.tf(bags.START_NS, CAMERA, "depth", T_color_depth)))
-        for n in range(6):
-            ns = bags.stamp_of(n)
-            kept.append(("/cam/depth/image_rect_raw", ns, m.image(ns, "depth", depth, "16UC1")))
-            kept.append(("/cam/depth/camera_info", ns, m.info(ns, "depth", own)))
-        return kept
+        tf = ("/tf_static", bags.START_NS + 1, m.tf(bags.START_NS, CAMERA, "depth", T_color_depth))
+        times = [bags.stamp_of(n) for n in range(6)]
+        images = [("/cam/depth/image_rect_raw", ns, m.image(ns, "depth", depth, "16UC1")) for ns in times]
+        infos = [("/cam/depth/camera_info", ns, m.info(ns, "depth", own)) for ns in times]
+        return [*without(DEPTH, DEPTH_INFO)(m, events), tf, *images, *infos]
 
     report, frames = imported(make(tmp_path, "ros1", change))
-    assert notice(report, "/cam/depth/image_rect_raw is registered to /cam/color/image_raw")
+    assert "/cam/depth/image_rect_raw is registered to /cam/color/image_raw" in said(report)
     got = frames[0].depth_m
     assert got is not None and set(np.unique(got).tolist()) == {0.0, 1.5, 2.0}
     # Column u of depth goes to 2 u + 0.5 + 66 * 0.03 / z of colour: two pixels further at 1.5 m, one at 2 m.
@@ -264,19 +247,17 @@ def two_cameras(m: Messages, events: list[Event]) -> list[Event]:
 
 def test_of_two_cameras_one_has_to_be_named(tmp_path: Path) -> None:
     src = make(tmp_path, "sqlite3", two_cameras)
-    with pytest.raises(ImportSourceError, match=r"several topics fit the image: /cam/color/image_raw \(rgb8\), /rear/"):
-        imported(src)
-    with pytest.raises(ImportSourceError, match=r"several topics fit the depth"):
-        imported(src, topics={"image": COLOR})
+    for topics, complaint in (
+        ({}, r"several topics fit the image: /cam/color/image_raw \(rgb8\), /rear/"),
+        ({"image": COLOR}, r"several topics fit the depth"),
+        ({"image": "/side"}, r"no topic '/side' fits the image; there are /cam"),
+        ({"rgb": COLOR}, r"no topic has the role 'rgb'; the roles are image, depth, info, depth_info, pose"),
+    ):
+        with pytest.raises(ImportSourceError, match=complaint):
+            imported(src, topics=topics)
     report, frames = imported(src, topics={"image": COLOR, "depth": "none"})
     assert report.with_depth == 0 and np.array_equal(frames[1].rgb, FRAMES[1].rgb)
     assert imported(src, topics={"image": "/rear/color/image_raw", "depth": DEPTH})[0].with_depth == 6
-    with pytest.raises(ImportSourceError, match=r"no topic '/side' fits the image; there are /cam"):
-        imported(src, topics={"image": "/side"})
-    with pytest.raises(
-        ImportSourceError, match=r"no topic has the role 'rgb'; the roles are image, depth, info, depth_info, pose"
-    ):
-        imported(src, topics={"rgb": COLOR})
 
 
 @pytest.mark.parametrize(
@@ -318,11 +299,8 @@ def second_source(topic: str, metres: float, later_ns: int = 5 * MS) -> Change:
     """The robot's odometry again, on a topic, from one who sees it elsewhere."""
 
     def change(m: Messages, events: list[Event]) -> list[Event]:
-        told = list(events)
-        for n, T in enumerate(bags.bodies(LONG)):
-            ns = bags.stamp_of(n) + later_ns
-            told.append((topic, ns, m.tf(ns, "odom", "base_link", aside(T, metres))))
-        return told
+        told = [(bags.stamp_of(n) + later_ns, aside(T, metres)) for n, T in enumerate(bags.bodies(LONG))]
+        return [*events, *((topic, ns, m.tf(ns, "odom", "base_link", T)) for ns, T in told)]
 
     return change
 
@@ -430,15 +408,13 @@ def test_poses_without_stamps_have_the_time_of_their_receipt(tmp_path: Path, kin
                 for stamped in message.transforms:
                     stamped.header = m.header(0, stamped.header.frame_id)
             return events
-        kept = without("/tf")(m, events)
-        for n, T in enumerate(bags.bodies(FRAMES)):
-            message = m.odometry(0, T, "base_link") if kind == "odometry" else m.pose_stamped(0, T)
-            kept.append(("/pose", bags.stamp_of(n), message))
-        return kept
+        poses = [(m.odometry(0, T, "base_link"), m.pose_stamped(0, T)) for T in bags.bodies(FRAMES)]
+        told = [("/pose", bags.stamp_of(n), found[kind == "pose"]) for n, found in enumerate(poses)]
+        return [*without("/tf")(m, events), *told]
 
     report, frames = imported(make(tmp_path, "ros1", change), body="" if kind != "pose" else "base_link")
     named = "tf of 'base_link'" if kind == "tf" else "/pose"
-    assert notice(report, f"{named}: 6 messages without a stamp; the time of receipt stands for it")
+    assert f"{named}: 6 messages without a stamp; the time of receipt stands for it" in said(report)
     T_world_odom = bags.odom_in_map() if kind == "tf" else np.eye(4)
     for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
         assert np.abs(frame.T_world_camera - T_world_odom @ T @ bags.camera_on_base()).max() < 1e-6
@@ -459,7 +435,7 @@ def test_a_simulated_clock_begins_at_zero(tmp_path: Path) -> None:
         return made
 
     report, frames = imported(make(tmp_path, "mcap", change))
-    assert not notice(report, "stamp") and [frame.stamp_ns for frame in frames] == [
+    assert "stamp" not in said(report) and [frame.stamp_ns for frame in frames] == [
         n * bags.PERIOD_NS for n in range(6)
     ]
     for frame, T in zip(frames, bags.bodies(FRAMES), strict=True):
