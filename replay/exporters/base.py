@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 import scipy  # loads `spatial` when it is first used
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
 from semantic_mapper.types import Float64, PosedFrame, UInt8
 
+Name = TypeVar("Name", bound=str)
 MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 
 
@@ -19,7 +22,7 @@ MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 class ExportFrame:
     """A frame of a log."""
 
-    frame: PosedFrame  # decoded
+    frame: PosedFrame
     rgb: EncodedImage  # its colour image as the log holds it, packed again as PNG where the log holds raw pixels
     depth_scale: float  # units a metre of its depth image as the log holds it; 0 where it has none, or float32
 
@@ -40,6 +43,20 @@ class Exporter(Protocol):
     def finish(self) -> None:
         """Write what comes after the last frame."""
         ...
+
+
+def choose_format(path: Path, given: str | None, suffixes: dict[str, Name], formats: tuple[Name, ...]) -> Name:
+    """The one of ``formats`` in which to write a file or folder: as ``given``, else what its suffix tells.
+
+    Raises ConfigError: neither is one.
+    """
+    wanted = given or suffixes.get(path.suffix.lower())
+    for name in formats:
+        if name == wanted:
+            return name
+    raise ConfigError(
+        f"{path}: which format is that? The name may end in {' '.join(suffixes)}, or give --format {'|'.join(formats)}"
+    )
 
 
 def encoded(rgb: UInt8) -> EncodedImage:

@@ -8,11 +8,10 @@ Of each camera: ``/CAMERA/rgb`` (foxglove.CompressedImage, the log's own PNG or 
 
 from __future__ import annotations
 
-import json
-from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
@@ -20,61 +19,20 @@ from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.exporters.base import ExportFrame, encoded, quaternion
 from semantic_mapper.transport.images import depth_to_uint16
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 WORLD = "world"
-_NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
-_COUNT = {"type": "integer", "minimum": 0}
-_BYTES = {"type": "string", "contentEncoding": "base64"}
-_TIME = {
-    "type": "object",
-    "title": "time",
-    "properties": {"sec": _COUNT, "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999}},
-}
-
-
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-def _numbers(count: int | None = None) -> dict[str, Any]:
-    bounds = {} if count is None else {"minItems": count, "maxItems": count}
-    return {"type": "array", "items": _NUMBER, **bounds}
-
-
-SCHEMAS = {
-    "foxglove.CompressedImage": _object(timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
-    "foxglove.RawImage": _object(
-        timestamp=_TIME, frame_id=_TEXT, width=_COUNT, height=_COUNT, encoding=_TEXT, step=_COUNT, data=_BYTES
-    ),
-    "foxglove.CameraCalibration": _object(
-        timestamp=_TIME,
-        frame_id=_TEXT,
-        width=_COUNT,
-        height=_COUNT,
-        distortion_model=_TEXT,
-        D=_numbers(),
-        K=_numbers(9),
-        R=_numbers(9),
-        P=_numbers(12),
-    ),
-    "foxglove.FrameTransform": _object(
-        timestamp=_TIME,
-        parent_frame_id=_TEXT,
-        child_frame_id=_TEXT,
-        translation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER),
-        rotation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER),
-    ),
+_KINDS = {  # in JSON schemas, of what messages hold
+    bytes: {"type": "string", "contentEncoding": "base64"},
+    str: {"type": "string"},
+    int: {"type": "integer"},
+    float: {"type": "number"},
+    list: {"type": "array", "items": {"type": "number"}},
 }
 
 
 class FoxgloveExporter:
-    """Writes one file; chunks are compressed, which undoes what base64 adds.
-
-    Args:
-        path: Of the file.
-        info: Of the log.
-    """
+    """Writes one file; chunks are compressed, which undoes what base64 adds."""
 
     def __init__(self, path: Path, info: StreamInfo) -> None:
         self.notices: list[str] = []
@@ -96,14 +54,14 @@ class FoxgloveExporter:
         camera = f"/{frame.camera_id}"
         self._write("/tf", "foxglove.FrameTransform", frame, _transform(frame))
         self._write(f"{camera}/calibration", "foxglove.CameraCalibration", frame, head | _calibration(frame.intrinsics))
-        image = head | {"data": _base64(item.rgb.data), "format": item.rgb.encoding}
+        image = head | {"data": item.rgb.data, "format": item.rgb.encoding}
         self._write(f"{camera}/rgb", "foxglove.CompressedImage", frame, image)
         if frame.depth_m is not None:
             name = "depth" if frame.depth_sigma_m is None else "computed_depth"
             self._write(f"{camera}/{name}", "foxglove.RawImage", frame, head | _depth(frame.depth_m))
         if frame.label is not None and self._labels is not None:
             drawn = encoded(self._labels.colorize(frame.label))
-            image = head | {"data": _base64(drawn.data), "format": drawn.encoding}
+            image = head | {"data": drawn.data, "format": drawn.encoding}
             name = "pseudo_labels" if frame.label_is_pseudo else "labels"
             self._write(f"{camera}/{name}", "foxglove.CompressedImage", frame, image)
 
@@ -114,8 +72,8 @@ class FoxgloveExporter:
 
     def _write(self, topic: str, schema: str, frame: PosedFrame, message: dict[str, Any]) -> None:
         if schema not in self._schemas:
-            described = {"title": schema, **SCHEMAS[schema]}
-            self._schemas[schema] = self._writer.register_schema(schema, "jsonschema", json.dumps(described).encode())
+            described = {"title": schema, **_schema_of(message)}
+            self._schemas[schema] = self._writer.register_schema(schema, "jsonschema", msgspec.json.encode(described))
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[schema])
         self._writer.add_message(
@@ -123,7 +81,7 @@ class FoxgloveExporter:
             log_time=frame.stamp_ns,
             publish_time=frame.stamp_ns,
             sequence=frame.seq & 0xFFFFFFFF,
-            data=json.dumps(message, separators=(",", ":")).encode(),
+            data=msgspec.json.encode(message),
         )
 
 
@@ -131,12 +89,13 @@ def _time(stamp_ns: int) -> dict[str, int]:
     return {"sec": stamp_ns // 10**9, "nsec": stamp_ns % 10**9}
 
 
-def _base64(data: bytes) -> str:
-    return b64encode(data).decode("ascii")
+def _schema_of(message: dict[str, Any]) -> dict[str, Any]:
+    described = {name: _schema_of(v) if isinstance(v, dict) else _KINDS[type(v)] for name, v in message.items()}
+    return {"type": "object", "properties": described}
 
 
 def _transform(frame: PosedFrame) -> dict[str, Any]:
-    T: Float64 = frame.T_world_camera
+    T = frame.T_world_camera
     return {
         "timestamp": _time(frame.stamp_ns),
         "parent_frame_id": WORLD,
@@ -170,5 +129,5 @@ def _depth(depth_m: Float32) -> dict[str, Any]:
         "height": height,
         "encoding": "32FC1" if units is None else "16UC1",
         "step": width * data.itemsize,
-        "data": _base64(data.tobytes()),
+        "data": data.tobytes(),
     }

@@ -29,6 +29,7 @@ from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
+from semantic_mapper.replay.exporters.base import choose_format
 from semantic_mapper.types import Float64
 
 Format = Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"]
@@ -41,14 +42,12 @@ SUFFIXES: dict[str, Format] = {
     ".yaml": "grid",
     ".rrd": "rrd",
 }
-_TAKES: dict[Format, set[str]] = {  # besides min_weight and min_confidence
-    "ply": {"color"},
-    "ply-mesh": {"color"},
-    "obj": {"color"},
-    "glb": {"color", "up"},
-    "npz": set(),
-    "grid": {"up", "height", "resolution", "floor", "costs"},
-    "rrd": set(),
+FORMATS: tuple[Format, ...] = get_args(Format)
+# Formats that an option is for, besides min_weight and min_confidence.
+_OPTIONS: dict[str, tuple[Format, ...]] = {
+    "color": ("ply", "ply-mesh", "obj", "glb"),
+    "up": ("glb", "grid"),
+    **dict.fromkeys(("height", "resolution", "floor", "costs"), ("grid",)),
 }
 HEIGHT_M = (0.1, 1.8)  # what a robot of a person's height can hit; what is lower, it rolls over
 RESOLUTION_M = 0.05
@@ -82,42 +81,26 @@ class ExportReport:
 
 
 def format_of(path: Path, given: str | None) -> Format:
-    """The format of a file to write. Raises ConfigError: nothing is given, and the name does not tell."""
-    for name in get_args(Format):
-        if given == name:
-            return name
-    if given is not None or path.suffix.lower() not in SUFFIXES:
-        raise ConfigError(
-            f"{path}: which format is that? The name may end in {' '.join(SUFFIXES)}, or give --format "
-            f"{'|'.join(get_args(Format))}"
-        )
-    return SUFFIXES[path.suffix.lower()]
+    """See ``choose_format``."""
+    return choose_format(path, given, SUFFIXES, FORMATS)
 
 
 def parse_transform(text: str) -> Float64:
     """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
 
-    Raises ConfigError: neither of these. PoseError: the file holds something else than a rigid transform.
+    Raises ConfigError: neither of these. ShapeError, PoseError: the file holds something else than a rigid transform.
     """
+    numbers = _numbers(text)
+    if numbers is not None and numbers.shape == (4,):
+        return yaw_transform(numbers[:3], float(numbers[3]))
     try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        return _read_transform(Path(text))
-    if len(numbers) != 4 or not np.isfinite(numbers).all():
-        raise ConfigError(f"--transform '{text}': expected four numbers, x y z in metres and yaw in degrees")
-    return yaw_transform(np.array(numbers[:3]), numbers[3])
-
-
-def _read_transform(path: Path) -> Float64:
-    try:
-        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except FileNotFoundError as error:
-        raise ConfigError(f'--transform {path}: neither "x y z yaw_deg" nor a file') from error
+        T = np.loadtxt(Path(text), dtype=np.float64, ndmin=2)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"--transform {path}: cannot be read as numbers: {error}") from error
-    if T.shape != (4, 4):
-        raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
-    check_pose(T, str(path))
+        raise ConfigError(
+            f"--transform {text}: expected four numbers, x y z in metres and yaw in degrees, or a file with 4 rows of "
+            f"4 numbers: {error}"
+        ) from error
+    check_pose(T, text)
     return T
 
 
@@ -125,15 +108,19 @@ def parse_up(text: str) -> Float64 | None:
     """``auto`` (None), an axis of the world (x, -y, ...), or three numbers. Raises ConfigError: none of these."""
     if text == "auto":
         return None
-    if text in AXES:
-        return AXES[text]
-    try:
-        direction = np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError:
-        direction = np.zeros(0)
-    if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
+    direction = AXES[text] if text in AXES else _numbers(text)
+    if direction is None or direction.shape != (3,) or not direction.any():
         raise ConfigError(f"--up {text}: give auto, one of {' '.join(AXES)}, or three numbers such as '0 -1 0.2'")
     return direction / np.linalg.norm(direction)
+
+
+def _numbers(text: str) -> Float64 | None:
+    """Finite numbers, with spaces or commas between them; None where it is something else."""
+    try:
+        numbers = np.array(text.replace(",", " ").split(), np.float64)
+    except ValueError:
+        return None
+    return numbers if np.isfinite(numbers).all() else None
 
 
 def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
@@ -142,10 +129,9 @@ def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Expor
     Raises ConfigError: an option that the format cannot honour. MapError: nothing to write, a floor plan of a map
     without metres, impossible numbers, or the file cannot be written.
     """
-    for option in ("color", "up", "height", "resolution", "floor", "costs"):
-        if getattr(request, option) is not None and option not in _TAKES[request.format]:
-            able = ", ".join(name for name, takes in _TAKES.items() if option in takes)
-            raise ConfigError(f"--{option} means nothing for format {request.format}; it is for {able}")
+    for option, able in _OPTIONS.items():
+        if getattr(request, option) is not None and request.format not in able:
+            raise ConfigError(f"--{option} means nothing for format {request.format}; it is for {', '.join(able)}")
     if request.format == "grid":
         require_metres(voxel_map.scale_known, f"{path}: a floor plan")
         return _export_grid(voxel_map, path, request)

@@ -1,10 +1,7 @@
 """What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in five colourings, stage times.
 
 The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike. The SDK is an extra:
-import it from here.
-
-Raises:
-    DependencyError: on import, where the extra is not installed.
+import it from here. Raises DependencyError: on import, where the extra is not installed.
 """
 
 from __future__ import annotations
@@ -20,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import DependencyError, LogError
 from semantic_mapper.evaluation.upright import camera_up, ceiling_height, upright_rotation
+from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import (
@@ -60,7 +58,6 @@ FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
 GONE_COLOR = (150, 150, 150)
-COLOURINGS = ("class", "colour", "confidence", "measured", "age")
 MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
 AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
 CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
@@ -105,7 +102,7 @@ class RerunLog:
         self._cameras: list[str] = []
         self._paths: dict[str, CameraPath] = {}
         self._eye: Eye | None = None
-        self._aged = self._computed = False
+        self._colourings: list[str] = ["class"]  # of the map
         self._extent_m = -1.0  # of the map when the eye was set
         infos = [
             rr.AnnotationInfo(id=i, label=name, color=color)
@@ -130,10 +127,9 @@ class RerunLog:
 
     def log_frame(self, frame: PosedFrame, *, posed: bool = True) -> None:
         """A camera image with its pose, or the image alone where its pose is not of the map's world."""
-        path, k, T = self._camera(frame.camera_id), frame.intrinsics, frame.T_world_camera
-        size, scale = _logged_size(k)
+        path, k, T = self._camera(frame.camera_id), _as_logged(frame.intrinsics), frame.T_world_camera
         self._set_time(frame.stamp_ns, frame.seq)
-        rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+        rgb = cv2.resize(frame.rgb, (k.width, k.height), interpolation=cv2.INTER_AREA)
         self._stream.log(f"{path}/image/rgb", rr.Image(np.asarray(rgb, np.uint8)).compress(jpeg_quality=JPEG_QUALITY))
         if not posed:
             return
@@ -141,10 +137,10 @@ class RerunLog:
         self._stream.log(
             f"{path}/image",
             rr.Pinhole(
-                focal_length=(k.fx * scale, k.fy * scale),
-                principal_point=((k.cx + 0.5) * scale, (k.cy + 0.5) * scale),
-                width=size[0],
-                height=size[1],
+                focal_length=(k.fx, k.fy),
+                principal_point=(k.cx + 0.5, k.cy + 0.5),
+                width=k.width,
+                height=k.height,
                 camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=FRUSTUM_M,
             ),
@@ -153,7 +149,8 @@ class RerunLog:
 
     def log_update(self, update: MapUpdate, intrinsics: CameraIntrinsics) -> None:
         """What was rendered for a frame of a camera with these intrinsics, and how long it took."""
-        path, (size, _) = self._camera(update.camera_id), _logged_size(intrinsics)
+        path, k = self._camera(update.camera_id), _as_logged(intrinsics)
+        size = k.width, k.height
         self._set_time(update.stamp_ns, update.seq)
         label = cv2.resize(update.label, size, interpolation=cv2.INTER_NEAREST_EXACT)
         self._stream.log(f"{path}/image/semantics", rr.SegmentationImage(np.asarray(label, np.uint8)))
@@ -164,8 +161,7 @@ class RerunLog:
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
     def log_map(self, points: MapPoints, age_s: Float32 | None = None, stamp_ns: int | None = None) -> None:
-        """The map as it is now, coloured by class, camera colour, confidence and, where there is
-        something to tell, by what a sensor measured and by age.
+        """The map as it is now, in all colourings that it has something to tell in.
 
         Args:
             points: Of its surface.
@@ -175,7 +171,6 @@ class RerunLog:
         if stamp_ns is not None:
             self._set_time(stamp_ns, None)
         computed = computed_fraction(points)
-        self._look_at(points, aged=age_s is not None, computed=computed > 0)
         for camera, path in list(self._paths.items()):
             positions = np.stack([T[:3, 3] for T in list(path.poses)])
             self._stream.log(rr.new_entity_path(["world", "path", camera]), rr.LineStrips3D([positions]))
@@ -189,6 +184,7 @@ class RerunLog:
             looks["measured"] = {"colors": colors[points.measured.astype(np.intp)]}
         if age_s is not None:
             looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
+        self._look_at(points, list(looks))
         for name, look in looks.items():
             self._stream.log(f"world/map/{name}", rr.Points3D(points.xyz, radii=self._radius, **look))
         legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
@@ -255,21 +251,20 @@ class RerunLog:
             self._lay_out()
         return camera_path(camera)
 
-    def _look_at(self, points: MapPoints, *, aged: bool, computed: bool) -> None:
-        """Set the view again where the map is the first one, or has grown much."""
+    def _look_at(self, points: MapPoints, colourings: list[str]) -> None:
+        """Set the view again where the map is the first one, has grown much, or has other colourings."""
         if not len(points.xyz):
             return
         extent = float(np.linalg.norm(np.ptp(np.percentile(points.xyz, (1, 99), axis=0), axis=0)))
-        if (self._aged, self._computed) == (aged, computed) and extent <= REGROWN * self._extent_m:
+        if self._colourings == colourings and extent <= REGROWN * self._extent_m:
             return
         poses = [T for path in list(self._paths.values()) for T in list(path.poses)]
         self._eye = eye_on(points.xyz, camera_up(np.stack(poses)) if poses else None)
-        self._aged, self._computed, self._extent_m = aged, computed, extent
+        self._colourings, self._extent_m = colourings, extent
         self._lay_out()
 
     def _lay_out(self) -> None:
-        known = {"mapped": self._eye is not None, "aged": self._aged, "computed": self._computed}
-        self._stream.send_blueprint(layout(self._cameras, **known, eye=self._eye))
+        self._stream.send_blueprint(layout(self._cameras, self._colourings, self._eye))
 
     def _set_time(self, stamp_ns: int, seq: int | None) -> None:
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
@@ -287,19 +282,13 @@ def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:
     return rr.Points3D(xyz[z > 0], radii=MOVING_RADIUS_M, colors=MOVING_COLOR)
 
 
-def _logged_size(intrinsics: CameraIntrinsics) -> tuple[tuple[int, int], float]:
-    """Width and height of logged images, and their scale."""
-    scale = min(1.0, IMAGE_WIDTH / intrinsics.width)
-    return (round(intrinsics.width * scale), round(intrinsics.height * scale)), scale
+def _as_logged(k: CameraIntrinsics) -> CameraIntrinsics:
+    width = min(k.width, IMAGE_WIDTH)
+    return scale_intrinsics(k, width, round(k.height * width / k.width))
 
 
 class RerunExporter:
-    """Writes one file, with the writer that draws sessions.
-
-    Args:
-        path: Of the file.
-        info: Of the log.
-    """
+    """Writes one file, with the writer that draws sessions."""
 
     def __init__(self, path: Path, info: StreamInfo) -> None:
         self.notices: list[str] = []
@@ -388,10 +377,7 @@ def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool, computed:
     measured, where a fraction ``computed`` was not."""
     rows = class_rows(labels, label_set)
     if computed:
-        rows += [
-            ("measured", MEASURED_COLOR, 1 - computed),
-            ("computed", COMPUTED_COLOR, computed),
-        ]
+        rows += [("measured", MEASURED_COLOR, 1 - computed), ("computed", COMPUTED_COLOR, computed)]
     scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
     scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
     width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
@@ -412,17 +398,13 @@ def camera_path(camera: str) -> str:
     return rr.new_entity_path(["world", "cameras", camera])
 
 
-def layout(
-    cameras: Sequence[str], *, mapped: bool, aged: bool, computed: bool = False, eye: Eye | None
-) -> rrb.Blueprint:
+def layout(cameras: Sequence[str], colourings: Sequence[str], eye: Eye | None) -> rrb.Blueprint:
     """The map in one tab a colouring, the legend next to it, the images of each camera, and the times of all stages.
 
     Args:
         cameras: Their names; none for a map alone.
-        mapped: There is a map.
-        aged: Its ages are known.
-        computed: No sensor measured some of it.
-        eye: From where to look first; None leaves it to the viewer.
+        colourings: Of the map.
+        eye: From where to look at the map first; None = there is no map yet.
     """
     seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb", "moving")]
     seen = [line.rstrip("/") for line in seen] + ["+ /world/path/**"]
@@ -437,25 +419,20 @@ def layout(
             eye_controls=eyes,
             line_grid=False,
         )
-        for name in COLOURINGS
-        if (aged or name != "age") and (computed or name != "measured")
+        for name in colourings
     ]
     space = rrb.Tabs(*maps, active_tab=0, name="map")
     legend = rrb.Spatial2DView(origin="/legend", name="legend")
-    above = rrb.Horizontal(space, legend, column_shares=[4, 1]) if mapped else space
+    above = rrb.Horizontal(space, legend, column_shares=[4, 1]) if eye is not None else space
     panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
     if not cameras:
         return rrb.Blueprint(above, rrb.TimePanel(state="hidden"), *panels)
+    kinds = ("rgb", "semantics", "depth")
     rows = [
-        rrb.Horizontal(
-            *(
-                rrb.Spatial2DView(origin=f"{camera_path(c)}/image", contents=f"$origin/{part}", name=f"{c}: {part}")
-                for part in ("rgb", "semantics", "depth")
-            )
-        )
+        [rrb.Spatial2DView(origin=f"{camera_path(c)}/image", contents=f"$origin/{k}", name=f"{c}: {k}") for k in kinds]
         for c in cameras
     ]
-    images = rows[0] if len(rows) == 1 else rrb.Tabs(*rows)
+    images = rrb.Horizontal(*rows[0]) if len(rows) == 1 else rrb.Tabs(*(rrb.Horizontal(*row) for row in rows))
     times = rrb.TimeSeriesView(origin="/stage_ms", name="stage times, ms")
     below = rrb.Horizontal(images, times, column_shares=[3, 2])
     return rrb.Blueprint(

@@ -11,7 +11,7 @@ from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import atomic_folder, atomic_path, write_bytes
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT
-from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
+from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, choose_format, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.exporters.foxglove import FoxgloveExporter
 from semantic_mapper.replay.log.sequence import Log
@@ -42,21 +42,8 @@ class LogExportReport(NamedTuple):
 
 
 def log_format_of(path: Path, given: str | None) -> LogFormat:
-    """The format of a file or folder to write.
-
-    Raises ConfigError: nothing is given, and the name does not tell; or it is a format for maps.
-    """
-    for name in FORMATS:
-        if given == name:
-            return name
-    if given is not None:
-        raise ConfigError(f"--format {given} is for saved maps; logs can be written as {', '.join(FORMATS)}")
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(
-            f"{path}: which format is that? Logs are written as .mcap (Foxglove), .rrd (Rerun), .txt (trajectory), or "
-            f"a folder without ending; or give --format {'|'.join(FORMATS)}"
-        )
-    return _SUFFIXES[path.suffix.lower()]
+    """See ``choose_format``."""
+    return choose_format(path, given, _SUFFIXES, FORMATS)
 
 
 def export_log(
@@ -70,30 +57,24 @@ def export_log(
 ) -> LogExportReport:
     """Write the frames of a log; ``out`` is there only once it is whole.
 
+    Raises ConfigError: a camera that is not in the log, or several where the format holds one. MapError: the format
+    states metres, and the log has none. LogError: ``out`` is there already (a file that is no log is replaced), or
+    cannot be written; or no frame could be.
+
     Args:
         log: To read; damaged frames are passed over and stand in its ``errors``.
-        out: File or folder to make; a file is replaced, a folder never.
+        out: File or folder to make.
         name: The format.
         camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
         max_frames: Stop after this many; 0 = all.
         on_frame: Called for each frame that was looked at.
-
-    Raises:
-        ConfigError: a camera that is not in the log, or several where the format holds one.
-        MapError: the format states metres, and the log has none.
-        LogError: ``out`` is there already, or cannot be written; or no frame could be.
     """
     if name == "tum":
         require_metres(log.info.scale_known, f"{out}: depth and poses of a TUM sequence are in metres")
     is_folder = name in _FOLDERS
-    if is_folder and out.exists():
-        raise LogError(f"{out}: exists already; name a folder that is to be made")
-    if out.is_dir():
-        raise LogError(f"{out}: is a folder; give the name of a file")
-    if not is_folder and out.suffix == ".mcap" and out.exists() and out.resolve() != log.path.resolve():
-        raise LogError(f"{out}: exists already, and may be a log of its own; give another name")
-    if out.resolve() == log.path.resolve():
-        raise ConfigError(f"{out}: is the log itself; choose another name for the result")
+    is_log = out.suffix == ".mcap" or out.resolve() in [path.resolve() for path in log.paths]
+    if out.exists() and (is_folder or out.is_dir() or is_log):
+        raise LogError(f"{out}: exists already, and only a file that is no log is replaced; give another name")
     camera = _choose_camera(log, camera, name)
     left_out: list[str] = []
     frames = 0
@@ -136,15 +117,12 @@ def _choose_camera(log: Log, camera: str, name: LogFormat) -> str:
     if not camera and name not in _ONE_CAMERA:
         return ""
     there = sorted({envelope.source for envelope, _ in log.frame_parts()})
-    if camera and camera not in there:
-        raise ConfigError(f"--camera {camera}: the log has frames of {', '.join(there) or 'none'}")
-    if name in _ONE_CAMERA and not camera and len(there) > 1:
-        raise ConfigError(f"{name} holds one camera; name one of {', '.join(there)} with --camera")
+    if camera not in there if camera else len(there) > 1:
+        raise ConfigError(f"{name}: name one camera of the log with --camera: {', '.join(there) or 'there is none'}")
     return camera
 
 
 def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:
-    """Decode a frame."""
     frame = decode_as(PosedFrame, parts)
     if envelope.rgb_encoding == "raw":
         return ExportFrame(frame, encoded(frame.rgb), envelope.depth_scale)
