@@ -71,10 +71,10 @@ def fit_panoptic(task: FitTask) -> Fitted:
     """Fit a ``Panoptic``; stopped before its classes are learned, these are those of the boxes alone.
 
     The label images of the frames are the pseudo labels. ``start`` is a ``Panoptic`` with the boxes, whose weights are
-    not looked at; without boxes pseudo labels alone teach, where ``config`` leaves out the losses that need some.
-    ``budget.steps``, if not 0, is the number of steps of each of its two parts.
-    Raises ConfigError: no boxes, none of them in view, or no class in common with the pseudo labels. FrameError: no
-    pseudo label, or what ``fit_grid`` refuses. WeightsError: ``start`` has other classes.
+    not looked at; there may be none where ``config`` leaves out the losses that need some. ``budget.steps``, if not 0,
+    is the number of steps of each of its two parts. Raises ConfigError: no boxes, none of them in view, or no class in
+    common with the pseudo labels. FrameError: no pseudo label, or what ``fit_grid`` refuses. WeightsError: ``start``
+    has other classes.
     """
     _, label_set, start, config, budget = task
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
@@ -98,8 +98,7 @@ def fit_panoptic(task: FitTask) -> Fitted:
         return shown_boxes(start.moving, seen, rays)[0]
 
     shape = msgspec.structs.replace(start.shape, boxes=boxes)
-    leave_out = shows_movers if len(start.moving) else None
-    field, grid = fit_geometry(task._replace(frames=frames), shape, Panoptic.kind, GRID_UNTIL, leave_out)
+    field, grid = fit_geometry(task._replace(frames=frames), shape, Panoptic.kind, GRID_UNTIL, shows_movers)
     assert isinstance(field, Panoptic)
     data = pseudo_rays(grid.frames, label_set, config.width)
     still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
@@ -146,10 +145,9 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
 
 
 def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> dict[str, float]:
-    """What boxes that stand still and pseudo labels have to do with each other, of some of the pixels.
-    Returns ``boxes``, and how many of these are ``seen``; fractions of the pixels whose ray meets one (``covered``),
-    and of those with a pseudo label whose class is possible on their ray (``matched``). Raises ConfigError: no pixel
-    meets a box, or boxes and pseudo labels have no class in common."""
+    """How many ``boxes`` stand still and are ``seen``; fractions of some of the pixels whose ray meets one
+    (``covered``), and of those with a pseudo label whose class is possible on their ray (``matched``).
+    Raises ConfigError: no pixel meets a box, or boxes and pseudo labels have no class in common."""
     if not len(field.primitives):
         return {"boxes": 0, "seen": 0, "covered": 0.0, "matched": 1.0}
     pixels = np.random.default_rng(config.seed).integers(0, len(data.rays), SURVEYED)
@@ -290,12 +288,12 @@ def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> B
     cone = np.array([_half_angle(frame) for frame in frames])
     seen = np.zeros(len(boxes), np.bool_)
     for number, box in enumerate(boxes):
-        centre, radius = _ball(box)
+        radius = float(np.linalg.norm(box.size / 2 + LOOSE_M))
         there = [box.T_world_box if box.stamps is None else box.pose_at(frame.stamp_ns) for frame in frames]
         shown = np.array([place is not None for place in there], np.bool_)
         if not shown.any():
             continue
-        away = np.array([p[:3, :3] @ centre + p[:3, 3] for p in there if p is not None]) - pose[shown, :3, 3]
+        away = np.array([p[:3, 3] for p in there if p is not None]) - pose[shown, :3, 3]
         z, distance = (away * pose[shown, :3, 2]).sum(1), np.linalg.norm(away, axis=1)
         angle = np.arccos(np.clip(z / np.maximum(distance, 1e-9), -1, 1))
         wide = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
@@ -316,16 +314,6 @@ def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32) -> 
         f"no box is in view of any frame: boxes lie from {lowest} to {highest}, cameras from {first} to {last}. Are "
         "the boxes in the log's world frame, and the stamps of those that move the log's, in nanoseconds?"
     )
-
-
-def _ball(box: Primitive) -> tuple[Float64, float]:
-    """Centre (3,) in the box's axes and radius of a ball round it and what may still be of its class."""
-    low, high = -box.size / 2, box.size / 2
-    if box.vertices is not None:
-        low, high = box.vertices.min(0), box.vertices.max(0)
-    elif box.polygon is not None:
-        low, high = (np.append(f(box.polygon, axis=0), z) for f, z in ((np.min, low[2]), (np.max, high[2])))
-    return (low + high) / 2, float(np.linalg.norm((high - low) / 2 + LOOSE_M))
 
 
 def _half_angle(frame: PosedFrame) -> float:

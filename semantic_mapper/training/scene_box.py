@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -75,8 +75,12 @@ def check_parallax(frames: Sequence[PosedFrame], box: GridConfig) -> None:
 
 def depth_bounds(frames: Sequence[PosedFrame]) -> Corners:
     """Corners of the box that the frames' depth reaches; one frame has some, at least."""
-    points = np.concatenate([_measured(f) for f in frames if f.depth_m is not None])
-    low, high = np.percentile(points, (OUTLIERS, 100 - OUTLIERS), axis=0)
+    points: list[Float32] = []
+    for frame in frames:
+        depth = resize_depth(frame, frame.intrinsics)
+        measured = unproject(depth, frame.intrinsics)[depth > 0][::EVERY]
+        points.append(transform(frame.T_world_camera, measured).astype(np.float32))
+    low, high = np.percentile(np.concatenate(points), (OUTLIERS, 100 - OUTLIERS), axis=0)
     return _with_margin(low, high, MARGIN)
 
 
@@ -121,13 +125,6 @@ def _tiles(frame: PosedFrame, points: Float64) -> Float64:
     return transform(frame.T_world_camera, np.concatenate(found))
 
 
-def _measured(frame: PosedFrame) -> Float32:
-    """Some of the measured points (N, 3) in the world."""
-    depth = resize_depth(frame, frame.intrinsics)
-    points = unproject(depth, frame.intrinsics)[depth > 0][::EVERY]
-    return transform(frame.T_world_camera, points).astype(np.float32)
-
-
 def _frustum(frame: PosedFrame, far_m: float) -> np.ndarray:
     """The camera and the corners of its image at ``far_m`` (5, 3) in the world."""
     k = frame.intrinsics
@@ -136,15 +133,11 @@ def _frustum(frame: PosedFrame, far_m: float) -> np.ndarray:
     return transform(frame.T_world_camera, np.concatenate((np.zeros((1, 3)), corners)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Features:
-    """Of one frame: places (N, 2) in pixels, descriptors (N, D), K (3, 3), T_camera_world (4, 4), centre (3,)."""
-
-    places: Float32
-    descriptors: Float32
-    K: Float64
-    T_camera_world: Float64
-    centre: Float64
+class _Features(NamedTuple):
+    places: Float32  # (N, 2) pixels
+    descriptors: Float32  # (N, D)
+    P: Float64  # (3, 4) projection of points of the world
+    centre: Float64  # (3,) of the camera
 
 
 def sparse_points(frames: Sequence[PosedFrame]) -> Float64:
@@ -170,7 +163,7 @@ def _features(frame: PosedFrame) -> _Features | None:
         return None
     places = np.array([point.pt for point in points], np.float32)
     pose = frame.T_world_camera
-    return _Features(places, np.asarray(descriptors, np.float32), camera_matrix(k), invert_pose(pose), pose[:3, 3])
+    return _Features(places, np.asarray(descriptors, np.float32), camera_matrix(k) @ invert_pose(pose)[:3], pose[:3, 3])
 
 
 def _triangulated(a: _Features, b: _Features) -> Float64:
@@ -180,14 +173,13 @@ def _triangulated(a: _Features, b: _Features) -> Float64:
     if not good:
         return np.zeros((0, 3))
     at_a, at_b = a.places[[m.queryIdx for m in good]], b.places[[m.trainIdx for m in good]]
-    P_a, P_b = a.K @ a.T_camera_world[:3], b.K @ b.T_camera_world[:3]
-    homogeneous = cv2.triangulatePoints(P_a, P_b, at_a.T.astype(np.float64), at_b.T.astype(np.float64)).T
+    homogeneous = cv2.triangulatePoints(a.P, b.P, at_a.T.astype(np.float64), at_b.T.astype(np.float64)).T
     w = homogeneous[:, 3:]
     xyz = homogeneous[:, :3] / np.where(np.abs(w) < 1e-12, 1e-12, w)
     to_a, to_b = a.centre - xyz, b.centre - xyz
     cosine = (to_a * to_b).sum(1) / np.maximum(np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1), 1e-12)
     kept = cosine < np.cos(np.deg2rad(LEAST_ANGLE_DEG))
-    for P, at in ((P_a, at_a), (P_b, at_b)):
+    for P, at in ((a.P, at_a), (b.P, at_b)):
         uvw = xyz @ P[:, :3].T + P[:, 3]
         error = np.linalg.norm(uvw[:, :2] / np.where(np.abs(uvw[:, 2:]) < 1e-12, 1e-12, uvw[:, 2:]) - at, axis=1)
         kept &= (uvw[:, 2] > 0) & (error < LARGEST_ERROR_PX)

@@ -39,10 +39,7 @@ def candidate_from_frame(frame: PosedFrame) -> Candidate:
 
 def choose_keyframes(candidates: Sequence[Candidate], count: int, seed: int) -> list[int]:
     """Greedy cover: each pick adds the cells that most pixels of the whole log fall in. Sorted indices.
-
-    Labels play no part. Frames without depth are spread evenly over time instead. ``seed`` draws among picks that are
-    within 2 % of the best.
-    """
+    Frames without depth are spread evenly over time instead. ``seed`` draws among picks within 2 % of the best."""
     count = min(count, len(candidates))
     if any(len(c.cells) == 0 for c in candidates):
         return sorted({int(i) for i in np.linspace(0, len(candidates) - 1, count + 2)[1:-1].round()})
@@ -77,9 +74,8 @@ def suggest_frames(
 ) -> list[Suggestion]:
     """The most useful frames to label, best first; fewer where the others would add nothing.
 
-    Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones. ``candidates``:
-    frames in the order of the log, ``labelled`` ones (their indices) among them. ``weights``: (P,) what each of a
-    candidate's pixels counts, one array a candidate; None = all alike.
+    Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones. ``labelled``:
+    indices of candidates. ``weights``: (P,) what each pixel of a candidate counts; None = all alike.
     """
     if not any(len(c.cells) for c in candidates):
         return [Suggestion(index, None, None) for index in _farthest_in_time(candidates, count, labelled)]

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import DependencyError, ShapeError
@@ -76,19 +75,11 @@ def test_a_kernel_that_the_library_has_not_or_has_otherwise_is_named() -> None:
         kernel(no_such_kernel)()
 
 
-def test_a_missing_library_is_named_and_how_to_get_it(tmp_path: Path) -> None:
+def test_a_library_that_is_missing_or_of_another_machine_is_named(tmp_path: Path) -> None:
     with pytest.raises(DependencyError, match=f"no compiled kernels for .* in {tmp_path}.*make setup"):
         binding.load_library(tmp_path)
-
-
-def test_a_library_of_another_machine_is_named(tmp_path: Path) -> None:
     library = tmp_path / f"kernels-{platform.machine()}.so"
     header = b"\x7fELF\x02\x01\x01" + bytes(9) + struct.pack("<HH", 3, 8)  # a 64-bit shared object for MIPS
     library.write_bytes(header.ljust(64, b"\0"))
     with pytest.raises(DependencyError, match=f"cannot load the compiled kernels {library}"):
         binding.load_library(tmp_path)
-
-
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other machines have one library")
-def test_the_library_fits_the_processor_as_torch_sees_it() -> None:
-    assert binding.has_avx2() == (torch.backends.cpu.get_cpu_capability() != "DEFAULT")

@@ -8,7 +8,6 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields import device
 from semantic_mapper.fields.encoder import calibrate
-from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig
@@ -16,6 +15,7 @@ from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.fit import FitProgress
 from semantic_mapper.training.losses import image_loss
 from semantic_mapper.training.views import stack_sources, view_from_frame
+from tests.fields.tiny_fields import tiny
 from tests.small import tiny_field, tiny_frames
 
 
@@ -71,13 +71,11 @@ def test_steps_on_images_teach_the_own_image_and_adapt_the_norms():
     kept = config(steps=30, held_out_fraction=0.0, image_fraction=1.0)  # the last weights are kept
     fitted = finetune(frames, ROOMS, start, kept).model
     views = stack_sources([view_from_frame(f, ROOMS, 96) for f in frames], with_labels=True)
-    losses = []
-    for field in (start, fitted):
-        with torch.inference_mode():
-            logits = field.eval().source_logits(field.encode(views))
-        assert logits is not None and views.channel is not None
-        losses.append(float(image_loss(logits, views.channel, 0.0)))
-    assert losses[1] < 0.7 * losses[0]
+    with torch.inference_mode():
+        before, after = (
+            image_loss(f.eval().source_logits(f.encode(views)), views.channel, 0.0) for f in (start, fitted)
+        )
+    assert after < 0.7 * before
     before, after = start.state_dict(), fitted.state_dict()
     assert any(not torch.equal(after[n], before[n]) for n in before if n.endswith("running_mean"))
 
@@ -98,17 +96,9 @@ def test_the_own_image_counts_more_where_its_encoder_learned_the_scene(
 
 
 def test_a_per_image_network_is_finetuned_and_judged_on_its_own_views():
-    torch.manual_seed(0)
-    shape = {"feature_dim": 16, "encoder": {"channels": [8, 16], "blocks": [1, 1]}}
     seen: list[float] = []
-    start = build_field("unet", shape, ROOMS)
-    result = finetune(
-        tiny_frames(4),
-        ROOMS,
-        start,
-        config(steps=40, frozen_encoder_fraction=0.5),
-        lambda p: seen.append(p.held_out_loss),
-    )
+    start, budget = tiny("unet", label_set=ROOMS), config(steps=40, frozen_encoder_fraction=0.5)
+    result = finetune(tiny_frames(4), ROOMS, start, budget, lambda p: seen.append(p.held_out_loss))
     assert result.recipe["held_out_loss"] < 0.9 * seen[0]
 
 
@@ -122,11 +112,9 @@ def test_a_stop_request_ends_it_with_the_best_weights_so_far():
 
 
 def test_too_few_or_unlabelled_keyframes_are_refused():
-    with pytest.raises(FrameError, match="at least 2 frames, one of them labelled"):
-        finetune(tiny_frames(4)[:1], ROOMS, None, config())
-    blind = [dataclasses.replace(f, label=None) for f in tiny_frames(3)]
-    with pytest.raises(FrameError, match="at least 2 frames, one of them labelled"):
-        finetune(blind, ROOMS, None, config())
+    for frames in (tiny_frames(4)[:1], [dataclasses.replace(f, label=None) for f in tiny_frames(3)]):
+        with pytest.raises(FrameError, match="at least 2 frames, one of them labelled"):
+            finetune(frames, ROOMS, None, config())
 
 
 def test_frames_without_labels_are_source_views_only():

@@ -92,19 +92,11 @@ def test_a_trunk_learns_colours_in_the_grids_geometry() -> None:
     assert solid.sum() > 500 and error < 0.85 * rays.colours(pixels).var(0).mean()
 
 
-def test_poses_that_only_turn_are_refused() -> None:
-    still = []
-    for frame in planes():
-        T = frame.T_world_camera.copy()
-        T[:3, 3] = (1.0, 2.0, 3.0)
-        still.append(replace(frame, T_world_camera=T))
+def test_poses_that_only_turn_or_do_not_fit_the_images_are_refused() -> None:
+    still = [replace(f, T_world_camera=np.c_[f.T_world_camera[:, :3], (1, 2, 3, 1)]) for f in planes()]
     with pytest.raises(FrameError, match=r"only turn tell no depth.*T_world_camera, with translations in metres"):
         fit_grid(still, SMALL)
-
-
-def test_poses_that_do_not_fit_the_images_are_refused() -> None:
-    # The camera axes of OpenGL (y up, z backward): every view looks away from the scene.
-    axes = np.diag([1.0, -1.0, -1.0, 1.0])
+    axes = np.diag([1.0, -1.0, -1.0, 1.0])  # those of OpenGL (y up, z backward): every view looks away from the scene
     wrong = [replace(f, T_world_camera=f.T_world_camera @ axes) for f in planes()]
     with pytest.raises(FrameError, match=r"hardly better than by their mean colour.*z forward"):
         fit_grid(wrong, SMALL)

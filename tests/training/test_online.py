@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -24,12 +25,6 @@ CONFIG = convert_config(
     OnlineConfig,
     "test",
 )
-
-
-def without_training() -> OnlineConfig:
-    """Weights that are hardly other ones, of which much is expected."""
-    finetune = {"steps": 1, "learning_rate": 1e-9, "width": 96, "step": {"rays": 32}}
-    return convert_config({"least_gain": 0.5, "finetune": finetune}, OnlineConfig, "test")
 
 
 def start_of(*stamps_ns: int) -> Checkpoint:
@@ -114,25 +109,18 @@ def test_labels_are_translated_by_class_name() -> None:
 def test_what_cannot_be_learned_from_is_refused_and_changes_nothing() -> None:
     pool = pool_of(FRAMES[:1])
     frame = FRAMES[1]
-    k = frame.intrinsics
     small = {n: getattr(frame, n)[:36, :48] for n in ("rgb", "depth_m", "label")}
-    for bad, labels, error, says in (
-        (dataclasses.replace(frame, label=None), ROOMS, FrameError, "no label image"),
-        (dataclasses.replace(frame, label=np.full_like(frame.label, 200)), ROOMS, LabelError, "200"),
-        (dataclasses.replace(frame, label=np.full_like(frame.label, 22)), NYU40, FrameError, None),
-        (dataclasses.replace(frame, T_world_camera=np.eye(4) * 2), ROOMS, PoseError, "keyframe seq="),
-        (
-            dataclasses.replace(frame, intrinsics=dataclasses.replace(k, width=48, height=36), **small),
-            ROOMS,
-            FrameError,
-            "48x36 pixels, but those before have 96x72",
-        ),
+    small["intrinsics"] = dataclasses.replace(frame.intrinsics, width=48, height=36)
+    unknown = np.full_like(frame.label, NYU40.id_of("whiteboard"))
+    for changes, labels, error, says in (
+        ({"label": None}, ROOMS, FrameError, "no label image"),
+        ({"label": np.full_like(frame.label, 200)}, ROOMS, LabelError, "200"),
+        ({"label": unknown}, NYU40, FrameError, "none of its pixels is of a class that the weights know"),
+        ({"T_world_camera": np.eye(4) * 2}, ROOMS, PoseError, "keyframe seq="),
+        (small, ROOMS, FrameError, "48x36 pixels, but those before have 96x72"),
     ):
-        if says is None:  # a class that the weights do not know
-            bad = dataclasses.replace(bad, label=np.full_like(bad.label, NYU40.id_of("whiteboard")))
-            says = "none of its pixels is of a class that the weights know"
         with pytest.raises(error, match=says):
-            pool.add(bad, labels)
+            pool.add(dataclasses.replace(frame, **changes), labels)
     assert len(pool) == 1
 
 
@@ -158,7 +146,8 @@ def test_labels_that_have_nothing_to_do_with_the_images_are_refused() -> None:
     bad = pool_of([scrambled(f, i) for i, f in enumerate(FRAMES[4:])])
     result = learn(bad.split(), start, CONFIG)
     assert result.score < 0.2 and "less than 0.2 (least_score)" in result.refusal and result.worse
-    once_more = learn(pool_of(FRAMES[4:]).split(), start, without_training())
+    hardly = msgspec.structs.replace(CONFIG.finetune, steps=1, learning_rate=1e-9)
+    once_more = learn(pool_of(FRAMES[4:]).split(), start, OnlineConfig(least_gain=0.5, finetune=hardly))
     assert once_more.score > 0.5 and "less than 0.5 gained" in once_more.refusal
 
 
@@ -168,12 +157,7 @@ def test_labels_that_contradict_validated_ones_are_refused_although_they_agree_w
     pool.validate([key_of(f) for f in FRAMES[:4]], 1)
     for frame in FRAMES[4:]:
         pool.add(permuted(frame), ROOMS)
-    config = convert_config(
-        {"least_gain": 0.0, "finetune": {"steps": 6, "width": 96, "step": {"rays": 128}}},
-        OnlineConfig,
-        "test",
-    )
-    result = learn(pool.split(), start, config)
+    result = learn(pool.split(), start, msgspec.structs.replace(CONFIG, least_gain=0.0))
     assert "contradict the old ones" in result.refusal and result.worse
 
 

@@ -171,14 +171,6 @@ def along_a_ray(field: Panoptic, *z: float) -> BoxesOnRays:
     return field.boxes_on(replace(samples, z=depths, points=points, weight=torch.ones_like(depths) / len(z)))
 
 
-def test_what_boxes_say_is_shared_where_they_overlap() -> None:
-    floor = box(2, "floor", (0.0, 0.0, 0.3), (4.0, 4.0, 1.0))
-    field = empty_field(DECK, floor, uncovered="empty")
-    found = along_a_ray(field, 0.5, 1.1, 1.35, 1.8)  # outside, deck, both, floor
-    assert found.fixed[0].tolist() == [[0, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0], [1, 0, 0, 0]]
-    assert found.on_ray[0].tolist() == [True, True, False, True]
-
-
 def test_near_the_faces_of_a_box_its_class_and_what_needs_no_box_are_possible() -> None:
     heights = (0.95, 0.98, 1.02, 1.05, 1.48)  # above the box, near its top (twice), inside, near its bottom
     table, rest, either = [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0]
@@ -240,20 +232,18 @@ def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int,
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     far = box(1, "table", (90.0, 0.0, 0.0), (1, 1, 1))
-    with pytest.raises(ConfigError, match=r"boxes lie from \(89.46, .*cameras from .*world frame"):
-        finetune(scene(), SET, empty_field(far), SMALL)
-    with pytest.raises(ConfigError, match="needs boxes"):
-        finetune(scene(), SET, empty_field(), SMALL)
-    with pytest.raises(FrameError, match="no frame has a pseudo label"):
-        finetune(scene(False), SET, empty_field(DECK), SMALL)
     only_lamps = [replace(f, label=np.full((48, 64), SET.ids[LAMP], np.uint8)) for f in scene()]
-    with pytest.raises(ConfigError, match=r"no class in common: labels say lamp, boxes table"):
-        finetune(only_lamps, SET, empty_field(DECK), SMALL)
     unknown = [replace(f, label=np.full((48, 64), SET.ignore_id, np.uint8)) for f in scene()]
-    with pytest.raises(FrameError, match=r"all pixels of all 8 pseudo labels are unknown \(id 0\)"):
-        finetune(unknown, SET, empty_field(DECK), SMALL)
     other = make_label_set("other", ["floor", "table"])
-    with pytest.raises(WeightsError, match=r"'deck'.*'other'"):
-        finetune(scene(), other, empty_field(DECK), SMALL)
+    for error, says, frames, labels, boxes in (
+        (ConfigError, r"boxes lie from \(89.46, .*cameras from .*world frame", scene(), SET, (far,)),
+        (ConfigError, "needs boxes", scene(), SET, ()),
+        (ConfigError, "no class in common: labels say lamp, boxes table", only_lamps, SET, (DECK,)),
+        (FrameError, "no frame has a pseudo label", scene(False), SET, (DECK,)),
+        (FrameError, r"all pixels of all 8 pseudo labels are unknown \(id 0\)", unknown, SET, (DECK,)),
+        (WeightsError, "'deck'.*'other'", scene(), other, (DECK,)),
+    ):
+        with pytest.raises(error, match=says):
+            finetune(frames, labels, empty_field(*boxes), SMALL)
     with pytest.raises(LabelError, match="a box is of class 'table'"):
         Panoptic(PanopticConfig(boxes=(DECK,)), make_label_set("none", ["floor"]))

@@ -29,12 +29,12 @@ MOST_VERTICES = 100_000  # of a box, about; a larger one has larger voxels
 
 
 class Meshes(NamedTuple):
-    """Closed meshes as kernels take them: vertices (V, 3), faces (F, 3), first face of each (P + 1,), bounds (P, 3)."""
+    """P closed meshes as kernels take them."""
 
-    vertices: Float64
-    faces: Int64
-    first: Int64
-    low: Float64
+    vertices: Float64  # (V, 3)
+    faces: Int64  # (F, 3)
+    first: Int64  # (P + 1,) first face of each
+    low: Float64  # (P, 3) bounds
     high: Float64
 
 
@@ -59,8 +59,7 @@ def ray_intervals(
 class Intervals:
     """Where R rays are inside of primitives: at most M intervals each, by ascending ``enter``."""
 
-    # (R, M) float32 metres of z; infinite after the last interval
-    enter: torch.Tensor
+    enter: torch.Tensor  # (R, M) float32 metres of z; infinite after the last interval
     leave: torch.Tensor
     index: torch.Tensor  # (R, M) int64 position of the primitive; -1 after the last
     count: torch.Tensor  # (R,) int64 how many there are; those beyond M are left out
@@ -106,25 +105,28 @@ class PrimitiveSet:
     def __len__(self) -> int:
         return len(self.primitives)
 
-    def intervals(self, rays: RayBatch, most: int = MAX_INTERVALS) -> Intervals:
+    def intervals(self, rays: RayBatch) -> Intervals:
         """Where rays (R,) are inside, from their near bound on, however far."""
-        far = np.full(len(rays.near_m), np.inf)
-        return self._intervals(_array(rays.origin), _array(rays.direction), _array(rays.near_m), far, most)
+        origin, direction, near = (
+            np.ascontiguousarray(t.detach().cpu().numpy(), np.float64)
+            for t in (rays.origin, rays.direction, rays.near_m)
+        )
+        return self._intervals(origin, direction, near, MAX_INTERVALS)
 
     def inside(self, points: Float64) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """Which points (N, 3) world metres are inside which primitive: (N, P) bool."""
         origin = np.ascontiguousarray(points, np.float64)
         # Out to beyond all of them, in a direction that no face of a box is likely to have.
         along = np.tile((0.8217, 0.4463, 0.3541), (len(origin), 1))
-        found = self._intervals(origin, along, np.zeros(len(origin)), np.full(len(origin), np.inf), max(len(self), 1))
+        found = self._intervals(origin, along, np.zeros(len(origin)), max(len(self), 1))
         result = np.zeros((len(origin), len(self)), np.bool_)
         here = (found.index >= 0) & (found.enter <= 0)
         row, column = here.nonzero(as_tuple=True)
         result[row.numpy(), found.index[row, column].numpy()] = True
         return result
 
-    def _intervals(self, origin: Float64, direction: Float64, near: Float64, far: Float64, most: int) -> Intervals:
-        count = len(origin)
+    def _intervals(self, origin: Float64, direction: Float64, near: Float64, most: int) -> Intervals:
+        count, far = len(origin), np.full(len(origin), np.inf)
         enter, leave = np.empty((count, most)), np.empty((count, most))
         mesh, found = np.empty((count, most), np.int32), np.empty(count, np.int64)
         ray_intervals(count, self.meshes, origin, direction, near, far, enter, leave, mesh, found)
@@ -134,10 +136,6 @@ class PrimitiveSet:
             torch.from_numpy(mesh).long(),
             torch.from_numpy(found),
         )
-
-
-def _array(tensor: torch.Tensor) -> Float64:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,7 +231,8 @@ def _some(rays: RayBatch, ray: torch.Tensor) -> RayBatch:
 
 def _merged(samples: RaySamples, met: RaysInBox, z: torch.Tensor, weight: torch.Tensor) -> RaySamples:
     """Samples (R, K) and those of a box (N, J) on N of the rays as (R, K + J)."""
-    there, ray = _some_samples(samples, met.ray), met.ray
+    ray = met.ray
+    there = replace(samples, z=samples.z[ray], weight=samples.weight[ray], light=samples.light[ray])
     behind = z[:, None] > there.z[..., None]  # N K J
     fraction = ray_fraction(there)
     of_box = weight * (1 - (fraction[..., None] * behind).sum(1)).clamp_min(0)
@@ -252,7 +251,3 @@ def _merged(samples: RaySamples, met: RaysInBox, z: torch.Tensor, weight: torch.
         torch.cat((mover, torch.full_like(blank, met.number, dtype=torch.long)), 1),
     )
     return merged.at(merged.z.argsort(1))
-
-
-def _some_samples(samples: RaySamples, ray: torch.Tensor) -> RaySamples:
-    return replace(samples, z=samples.z[ray], weight=samples.weight[ray], light=samples.light[ray])

@@ -1,8 +1,7 @@
 """Panoptic NeRF (Fu et al. 2022): coarse boxes and noisy label images become classes and instances of every view.
 
 Two semantic fields stand on one scene grid. The fixed one says what the boxes at a point say; through it, label images
-move the density. The learned one is a head on the grid's features; it decides where boxes overlap or end. Which thing a
-point is, the boxes say.
+move the density. The learned one is a head on the grid's features, and decides where boxes overlap or end.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from torch import nn
@@ -44,8 +43,8 @@ SKY = "sky"  # class of light that leaves the grid and meets no box, where the l
 class BoxesOnRays:
     """What boxes hold the K samples of R rays."""
 
-    # (R, K, M) bool, whether the sample is in the interval, and the box has a say there: in a core, those have whose
-    # centre it holds, such as books in a shelf
+    # (R, K, M) bool, whether the sample is in the interval and the box has a say: in a core, those whose centre it
+    # holds, such as books in a shelf
     box: torch.Tensor
     index: torch.Tensor  # (R, M) int64 number of the box of each interval, -1 = none
     named: torch.Tensor  # (R, K, L) classes of the boxes there: 0 or 1
@@ -114,10 +113,7 @@ class Panoptic(GridField):
 
     def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
         """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees what is behind
-        the grid.
-
-        A ray whose depth was measured ends there.
-        """
+        the grid. A ray whose depth was measured ends there."""
         samples = heaviest(self._at_measured(samples), SAMPLES)
         boxes = self.boxes_on(samples)
         points = boxes.fixed if self.shape.classes == "fixed" else boxes.allowed_of(self.learned(samples))
@@ -207,9 +203,7 @@ class Panoptic(GridField):
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
         """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 outside of all boxes.
-
-        Where boxes of one class overlap, a point is of the one whose centre is nearer.
-        """
+        Where boxes of one class overlap, a point is of the one whose centre is nearer."""
         samples = heaviest(self._at_measured(self.march(rays)), SAMPLES)
         fraction = ray_fraction(samples)
         still = fraction if samples.mover is None else fraction * (samples.mover < 0)
@@ -284,14 +278,7 @@ def merged_classes(label_set: LabelSet, merge: Mapping[str, Sequence[str]]) -> t
 def box_config(primitive: Primitive) -> BoxConfig:
     """A primitive as a field keeps it."""
     kept = {name: getattr(primitive, name) for name in BoxConfig.__struct_fields__}
-    return BoxConfig(**{name: _plain(value) for name, value in kept.items()})
-
-
-def _plain(value: Any) -> Any:
-    """Arrays as nested tuples."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
+    return msgspec.convert(msgspec.to_builtins(kept, enc_hook=np.ndarray.tolist), BoxConfig)
 
 
 def primitive_of(box: BoxConfig) -> Primitive:

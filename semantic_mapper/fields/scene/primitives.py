@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import ConvexHull  # pyright: ignore[reportMissingTypeStubs]
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import interpolate_pose
@@ -51,11 +52,8 @@ class Primitive:
         return self.stamps is not None or self.frames is not None
 
     def pose_at(self, stamp_ns: int) -> Float64 | None:
-        """Its pose (4, 4) at a time, between two stamps on the way from one to the other.
-
-        None where that is by more than half of the median gap of the stamps before the first or after the last, and of
-        one whose times are not known.
-        """
+        """Its pose (4, 4) at a time, between two stamps on the way from one to the other; None where its times are not
+        known, and by more than half of the median gap of the stamps before the first or after the last."""
         if self.stamps is None:
             return self.T_world_box if self.frames is None else None
         known = sorted(self.stamps, key=lambda entry: entry[0])
@@ -195,7 +193,8 @@ def _local_mesh(primitive: Primitive) -> tuple[Float64, Int64]:
 
 def _prism(polygon: Float64, height: float) -> tuple[Float64, Int64]:
     n = len(polygon)
-    if _area(polygon) < 0:
+    x, y = polygon.T
+    if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:  # clockwise
         polygon = polygon[::-1]
     low, high = (np.c_[polygon, np.full(n, z)] for z in (-height / 2, height / 2))
     cap = triangulate(polygon)
@@ -206,26 +205,11 @@ def _prism(polygon: Float64, height: float) -> tuple[Float64, Int64]:
 
 def _sphere() -> tuple[Float64, Int64]:
     """A sphere of diameter 1 as wide as the round one has volume."""
-    theta = np.pi * np.arange(1, RINGS) / RINGS
-    phi = 2 * np.pi * np.arange(AROUND) / AROUND
-    ring = np.stack(
-        (
-            np.outer(np.sin(theta), np.cos(phi)),
-            np.outer(np.sin(theta), np.sin(phi)),
-            np.outer(np.cos(theta), 1 + 0 * phi),
-        ),
-        -1,
-    )
+    theta, phi = np.pi * np.arange(1, RINGS)[:, None] / RINGS, 2 * np.pi * np.arange(AROUND) / AROUND
+    ring = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi), -1)
     vertices = 0.5 * np.concatenate(([(0, 0, 1)], ring.reshape(-1, 3), [(0, 0, -1)]))
-    i, j = np.arange(AROUND), (np.arange(AROUND) + 1) % AROUND
-    last = len(vertices) - 1
-    faces = [np.stack((0 * i, 1 + i, 1 + j), 1), np.stack((0 * i + last, last - AROUND + j, last - AROUND + i), 1)]
-    for k in range(RINGS - 2):
-        a, b = 1 + k * AROUND, 1 + (k + 1) * AROUND
-        faces += [np.stack((a + i, b + i, b + j), 1), np.stack((a + i, b + j, a + j), 1)]
-    faces = np.concatenate(faces)
-    volume = float((vertices[faces[:, 0]] * np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])).sum()) / 6
-    return vertices * (math.pi / 6 / volume) ** (1 / 3), faces
+    hull = ConvexHull(vertices)
+    return vertices * (math.pi / 6 / hull.volume) ** (1 / 3), hull.simplices.astype(np.int64)
 
 
 def triangulate(polygon: Float64) -> Int64:
@@ -257,8 +241,3 @@ def _cross(polygon: Float64, a: int, b: int, c: int) -> float:
 
 def _in_triangle(polygon: Float64, p: int, a: int, b: int, c: int) -> bool:
     return all(_cross(polygon, i, j, p) >= 0 for i, j in ((a, b), (b, c), (c, a)))
-
-
-def _area(polygon: Float64) -> float:
-    x, y = polygon.T
-    return 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
