@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -129,10 +130,10 @@ def refused(*arguments: str | Path, code: int = 1) -> str:
     return " ".join((done.stderr if code == 2 and "Usage:" in done.stderr else error_line(done.stderr)).split())
 
 
-def run_here(*arguments: str | Path) -> tuple[int, str]:
-    """As ``run``: exit code, and all that it said on one line."""
-    done = run(*arguments)
-    return done.returncode, " ".join((done.stdout + done.stderr).split())
+def launch_settings(log: Path, weights: Path, config: Path, *more: str) -> list[str]:
+    """Words for ``up``: a log for its camera, and what its mapper maps with."""
+    given = (f"camera.log={log}", f"mapper.weights={weights}", f"mapper.config={config}", *more)
+    return [word for setting in given for word in ("--set", setting)]
 
 
 def summary_of(out: Path) -> dict[str, Any]:
@@ -140,21 +141,50 @@ def summary_of(out: Path) -> dict[str, Any]:
     return json.loads((out / "summary.json").read_text())
 
 
+@dataclass
+class NodeHere:
+    """A node in a thread of this process."""
+
+    thread: threading.Thread
+    stop: StopRequest
+    error: Exception | None = None  # that it ended with
+
+    def wait(self, timeout_s: float = 100.0) -> None:
+        """Until it ends by itself."""
+        self.thread.join(timeout_s)
+        assert not self.thread.is_alive()
+
+
 @contextmanager
 def node_here(
-    work: Callable[[NodeContext, Any], object], name: str, endpoints: dict[str, str], options: Any, **more: Any
-) -> Iterator[tuple[threading.Thread, StopRequest]]:
-    """A node in a thread of this process; it is asked to stop at the end."""
+    work: Callable[[NodeContext, Any], object],
+    name: str,
+    endpoints: dict[str, str],
+    options: Any,
+    *,
+    beats: int = -1,
+    fails: bool = False,
+    **more: Any,
+) -> Iterator[NodeHere]:
+    """A node; it is asked to stop at the end. An error is that of the test unless the node may fail."""
     stop = StopRequest(patient=True)
-    context = NodeContext(name, endpoints, 1, stop, HeartbeatWriter(-1, 1), **more)
-    thread = threading.Thread(target=work, args=(context, options), daemon=True)
-    thread.start()
+    context = NodeContext(name, endpoints, 1, stop, HeartbeatWriter(beats, 1), **more)
+
+    def run() -> None:
+        try:
+            work(context, options)
+        except Exception as error:  # noqa: BLE001 - of any kind
+            node.error = error
+
+    node = NodeHere(threading.Thread(target=run, daemon=True), stop)
+    node.thread.start()
     try:
-        yield thread, stop
+        yield node
     finally:
         stop.signum = 15
-        thread.join(60)
-        assert not thread.is_alive()
+        node.wait(60)
+    if node.error is not None and not fails:
+        raise node.error
 
 
 class Running:
@@ -180,7 +210,7 @@ class Running:
     def __exit__(self, *exception: object) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        for pid in self.all_pids():
+        for pid in self.node_pids():
             if is_alive(pid):
                 os.kill(pid, signal.SIGKILL)
         self.process.wait()
@@ -208,16 +238,11 @@ class Running:
     def node_pids(self) -> list[int]:
         return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
 
-    def all_pids(self) -> list[int]:
-        """Of nodes."""
-        return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
-
     def node_pid(self, name: str) -> int:
         line = self.wait_for_line(rf"node_started.*node={name}\b")
         return int(re.findall(r"pid=(\d+)", line)[0])
 
     def _read(self) -> None:
-        assert self.process.stderr is not None
         for line in self.process.stderr:
             with self._grown:
                 self.lines.append(line.rstrip("\n"))
@@ -225,6 +250,13 @@ class Running:
         with self._grown:
             self._ended = True
             self._grown.notify_all()
+
+
+def addresses_listening(port: int) -> set[str]:
+    """On which somebody listens to a port, as the kernel writes them."""
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:] + Path("/proc/net/tcp6").read_text().splitlines()[1:]
+    sockets = (line.split() for line in lines)
+    return {s[1].split(":")[0] for s in sockets if s[3] == "0A" and int(s[1].split(":")[1], 16) == port}
 
 
 def is_alive(pid: int) -> bool:

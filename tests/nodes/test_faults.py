@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,9 +20,11 @@ from tests.nodes.support import (
     error_line,
     eventually,
     is_alive,
+    launch_settings,
     repeated_frames,
     run,
     run_ok,
+    summary_of,
     write_log,
 )
 
@@ -49,8 +50,7 @@ def long_log(folder: Path) -> Path:
 
 def live_settings(log: Path, weights: Path, config: Path) -> list[str]:
     """A log in the place of a live camera, and a recorder."""
-    mapper = [f"mapper.weights={weights}", f"mapper.config={config}", "mapper.save_every_s=1"]
-    return [f"camera.log={log}", "recorder.enabled=true", "heartbeat_s=0.8", *mapper]
+    return launch_settings(log, weights, config, "mapper.save_every_s=1", "recorder.enabled=true", "heartbeat_s=0.8")
 
 
 def alone(folder: Path, log: Path) -> Path:
@@ -75,9 +75,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
     long_log: Path, weights: Path, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "up"
-    settings = [*live_settings(long_log, weights, config)]
-    words = [word for setting in settings for word in ("--set", setting)]
-    with Running("up", LIVE_LAUNCH, *words, "--out", out) as running:
+    with Running("up", LIVE_LAUNCH, *live_settings(long_log, weights, config), "--out", out) as running:
         running.wait_for_line("all_ready")
         running.wait_for_line("map_saved")
         took: dict[str, float] = {}
@@ -102,10 +100,10 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text  # frames that were sent while there was no recorder are lost
         assert "the recorder was restarted, and what was sent meanwhile is missing" in error_line(running.text)
-        assert not any(map(is_alive, running.all_pids()))
+        assert not any(map(is_alive, running.node_pids()))
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_of(out)
     taken_up = [int(n) for n in re.findall(r"map_resumed .*frames=(\d+)", running.text)]
     assert len(taken_up) == 3 and f"saved after {taken_up[-1]} frames" in summary["restarted"]
     assert VoxelMap.load(out / "map.npz").frames == taken_up[-1] + summary["frames"]["fused"]
@@ -117,12 +115,9 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
 
 
 @pytest.mark.slow
-def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
-    long_log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
+def test_a_mapper_that_is_given_up_leaves_results(long_log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     out = tmp_path / "up"
-    words = [word for setting in live_settings(long_log, weights, config) for word in ("--set", setting)]
-    with Running("up", LIVE_LAUNCH, *words, "--out", out) as running:
+    with Running("up", LIVE_LAUNCH, *live_settings(long_log, weights, config), "--out", out) as running:
         running.wait_for_line("map_saved")
         restarts = 0
         while not re.search(r"node_restarts .*in_s=[1-9].*node=mapper", running.text):  # so long that it is away
@@ -131,19 +126,17 @@ def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
             running.wait_for_line(rf"node_restarts .*node=mapper .*restarts={restarts}\b")
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text
-        assert not any(map(is_alive, running.all_pids()))
+        assert not any(map(is_alive, running.node_pids()))
     assert (out / "summary.json").exists(), running.text
     assert "it had not been restarted yet when the launch ended" in error_line(running.text)
     saved = VoxelMap.load(out / "map.npz")
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_of(out)
     assert summary["map"]["blocks"] == saved.block_count > 0
     assert summary["stopped_by"] and f"saved after {saved.frames} frames" in summary["restarted"]
     assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
 
 
-def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the_reason(
-    long_log: Path, tmp_path: Path
-) -> None:
+def test_a_node_that_must_not_restart_ends_the_launch_with_the_reason(long_log: Path, tmp_path: Path) -> None:
     launch = alone(tmp_path, long_log)
     launch.write_text(launch.read_text().replace('restart = "on-failure"', 'restart = "never"'))
     with Running("up", launch) as running:
@@ -173,33 +166,26 @@ def test_killed_launcher_leaves_no_process_even_where_one_is_frozen(long_log: Pa
         running.wait_for_line("all_ready")
         os.kill(wait_for_start(running, "eye", 0), signal.SIGSTOP)
         running.process.kill()
-        assert eventually(lambda: not any(map(is_alive, running.all_pids())))
-
-
-@pytest.fixture
-def watched(long_log: Path, tmp_path: Path) -> Iterator[Running]:
-    with Running("up", alone(tmp_path, long_log)) as running:
-        running.wait_for_line("all_ready")
-        yield running
+        assert eventually(lambda: not any(map(is_alive, running.node_pids())))
 
 
 @pytest.mark.slow
-def test_top_shows_a_running_launch(watched: Running) -> None:
-    sockets = watched.wait_for_line("sockets=").split("sockets=")[1].split()[0]
-    pid = wait_for_start(watched, "eye", 0)
-    os.kill(pid, signal.SIGKILL)
-    pid = wait_for_start(watched, "eye", 1)
-    for _ in range(20):  # the new process first has to publish
-        done = run_ok("view", "--status", sockets, "--once", "--json")
-        shown = json.loads(done.stdout)
-        eye = shown["nodes"]["eye"]
-        if eye["counters"].get("published"):
-            break
+def test_top_shows_a_running_launch(long_log: Path, tmp_path: Path) -> None:
+    with Running("up", alone(tmp_path, long_log)) as running:
+        running.wait_for_line("all_ready")
+        sockets = running.wait_for_line("sockets=").split("sockets=")[1].split()[0]
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGKILL)
+        pid = wait_for_start(running, "eye", 1)
+        for _ in range(20):  # the new process first has to publish
+            shown = json.loads(run_ok("view", "--status", sockets, "--once", "--json").stdout)
+            eye = shown["nodes"]["eye"]
+            if eye["counters"].get("published"):
+                break
+        table = run("view", "--status", f"ipc://{sockets}/launch", "--once").stdout
     assert (eye["pid"], eye["restarts"]) == (pid, 1) and eye["memory_mb"] > 5
     assert eye["counters"]["published"] > 0 and eye["rates_hz"]["published"] > 0 and eye["ages_s"]["frame"] >= 0
     assert "killed by SIGKILL" in eye["degraded"][0] and 0 <= eye["ages_s"]["beat"] < eye["ages_s"]["start"]
-    assert shown["launch"]["pid"] == watched.process.pid and shown["launch"]["counters"]["restarts"] == 1
-    table = run("view", "--status", f"ipc://{sockets}/launch", "--once").stdout
+    assert shown["launch"]["pid"] == running.process.pid and shown["launch"]["counters"]["restarts"] == 1
     assert re.search(rf"eye +\w+ +{pid} ", table)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes import map_feed
-from semantic_mapper.nodes.map_feed import POINT, pack_points, thinned, thinning
+from semantic_mapper.nodes.map_feed import thinned, thinning
 
 
 def points(count: int) -> MapPoints:
@@ -22,12 +22,3 @@ def test_a_large_map_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     few = thinned(points(9))
     assert few.label.tolist() == [0, 3, 6] and few.xyz[1].tolist() == [9, 10, 11]
     assert [thinning(count) for count in (0, 4, 5, 8, 9)] == [1, 1, 2, 2, 3]
-
-
-def test_a_point_has_twenty_bytes_in_a_fixed_order() -> None:
-    packed = pack_points(points(3), np.full((3, 3), 7, np.uint8))
-    assert POINT.itemsize == 20 and len(packed) == 60
-    floats, rest = np.frombuffer(packed[20:32], "<f4"), list(packed[32:40])
-    assert floats.tolist() == [3, 4, 5] and rest == [7, 7, 7, 255, 1, 51, 0, 0], (
-        "a colour, opaque, class, 0.2, computed"
-    )

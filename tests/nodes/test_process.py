@@ -29,14 +29,11 @@ def test_first_signal_is_noted_the_second_interrupts_and_handlers_are_given_back
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) == before
-
-
-def test_patient_request_keeps_the_first_signal_and_that_of_a_launcher_is_no_failure() -> None:
     for first, name, code in ((signal.SIGTERM, "SIGTERM", 143), (STOP_SIGNAL, "the launcher", 0)):
         with StopRequest(patient=True, signals=(STOP_SIGNAL, signal.SIGTERM, signal.SIGINT)) as stop:
             for signum in (first, signal.SIGINT, signal.SIGTERM):
                 os.kill(os.getpid(), signum)
-            assert (stop.name, stop.exit_code) == (name, code)
+            assert (stop.name, stop.exit_code) == (name, code), "a patient one keeps the first"
 
 
 def test_threads_are_set_before_anything_heavy_is_loaded_and_the_users_choice_is_kept() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import tempfile
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +17,14 @@ from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
 from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
-from semantic_mapper.nodes.streams import MissingFrames, Streams
+from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-from tests.nodes.support import node_here, write_config, write_weights
+from tests.nodes.mapper.test_query_service import a_folder
+from tests.nodes.support import node_here, summary_of
 from tests.small import INTRINSICS, tiny_frames
 
 LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right eye", {"right": INTRINSICS})
@@ -32,12 +32,12 @@ LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right ey
 
 def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(tmp_path: Path) -> None:
     frame = tiny_frames(1)[0]
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+    with a_folder() as folder:
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "recorder")}
         options = RecorderOptions(out=str(tmp_path / "both.mcap"), sources=("left", "right"), streams=2)
         with (
             Publisher(endpoints["right"]) as right,
-            node_here(run_recorder, "recorder", endpoints, options) as (recorder, _),
+            node_here(run_recorder, "recorder", endpoints, options) as recorder,
         ):
             for restart in range(2):  # the camera's process dies after three frames and counts from 0 again
                 with Publisher(endpoints["left"]) as left:
@@ -53,7 +53,7 @@ def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(t
             for seq in range(2):
                 right.publish(encode_frame(replace(frame, camera_id="right", seq=seq, stamp_ns=20_000 + seq)))
             right.publish(encode(EndOfStream("right", "end", 2)))
-            recorder.join(20)
+            recorder.wait(20)
     with LogReader(tmp_path / "both.mcap") as log:
         frames = list(log)
         assert log.finished and not log.errors
@@ -65,56 +65,45 @@ def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(t
     assert [f.seq for f in frames if f.camera_id == "right"] == [0, 1]
 
 
-def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) -> None:
-    weights, config = write_weights(tmp_path / "tiny.safetensors"), write_config(tmp_path / "mapper.toml")
+def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path, weights: Path, config: Path) -> None:
     small = replace(INTRINSICS, cx=INTRINSICS.cx - 8, cy=INTRINSICS.cy - 6, width=80, height=60)
     infos = {"left": LEFT, "right": StreamInfo("right eye", {"right": small})}
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder, ExitStack() as stack:
+    with a_folder() as folder, ExitStack() as stack:
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "mapper")}
         files = {"out": str(tmp_path), "weights": str(weights), "config": str(config)}
         options = MapperOptions(**files, input=("left", "right"), delivery="all", query="")
         publishers = {name: stack.enter_context(Publisher(endpoints[name], policy="block")) for name in infos}
-        thread, _ = stack.enter_context(node_here(run_mapper, "mapper", endpoints, options))
+        node = stack.enter_context(node_here(run_mapper, "mapper", endpoints, options))
         for name, publisher in publishers.items():
             publisher.wait_for_subscribers("frame", timeout_s=120)
             publisher.publish(encode(infos[name], sender=name))
         for frame in tiny_frames(4):
             publishers["left"].publish(encode_frame(replace(frame, camera_id="left", label=None)), 120)
-            assert frame.depth_m is not None
             images = {"rgb": frame.rgb[6:66, 8:88].copy(), "depth_m": frame.depth_m[6:66, 8:88].copy()}
             cut = replace(frame, camera_id="right", **images, label=None, intrinsics=small)
             publishers["right"].publish(encode_frame(cut), 120)
         publishers["left"].publish(encode(EndOfStream("left", "end", 4)))
-        thread.join(0.5)
-        assert thread.is_alive()  # the other one has not ended
+        node.thread.join(0.5)
+        assert node.thread.is_alive()  # the other one has not ended
         publishers["right"].publish(encode(EndOfStream("right", "end", 5)))  # one was lost on the way
-        thread.join(200)
-        assert not thread.is_alive()
-    summary = json.loads((tmp_path / "summary.json").read_text())
+        node.wait(200)
+    summary = summary_of(tmp_path)
     assert sorted(summary["source"].split(" + ")) == ["left eye", "right eye"]  # whichever came first
     assert summary["stopped_by"] is None
     frames = summary["frames"]
     assert (frames["published"], frames["fused"], frames["dropped"], frames["refused"]) == (9, 8, 1, 0)
 
 
-def test_streams_end_together_and_say_what_each_said() -> None:
+def test_streams_end_together_and_those_of_other_classes_are_refused() -> None:
     streams = Streams(2)
-    assert not streams.begin(LEFT) and not streams.begin(RIGHT) and not streams.begin(LEFT)
-    assert streams.begin(msgspec.structs.replace(LEFT, frame_hz=5.0))
-    assert streams.source == "left eye + right eye" and streams.label_set is None
+    assert not streams.begin(LEFT) and not streams.begin(RIGHT)
     assert not streams.end(EndOfStream("a", "end", 3))
     assert not streams.end(EndOfStream("a", "error", 4, "unplugged"))  # restarted meanwhile
     assert streams.end(EndOfStream("b", "end", 5))
     assert (streams.published, streams.ended_by) == (9, "a: unplugged")
-    streams.note_frame("left")
-    assert streams.ages_s == {}
-    streams.note_frame("right")
-    assert set(streams.ages_s) == {"frame left", "frame right"}
+    streams.begin(msgspec.structs.replace(LEFT, label_set=ROOMS))
     with pytest.raises(NodeError, match="'another' have other classes than those of 'left eye'"):
         streams.begin(StreamInfo("another", {"third": INTRINSICS}, NYU40))
-    alone = Streams(1)
-    alone.begin(msgspec.structs.replace(LEFT, label_set=ROOMS))
-    assert alone.begin(msgspec.structs.replace(LEFT, label_set=NYU40))  # the same stream, which has changed
 
 
 def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path) -> None:
@@ -122,7 +111,7 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
     allow(tmp_path / "robot", "desk", desk.public.decode())
     allow(tmp_path / "desk", "robot", robot.public.decode())
     status = Status("mapper", "running", 5)
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+    with a_folder() as folder:
         own = f"ipc://{folder}/mapper"
         with pytest.raises(TransportError, match="needs keys on both sides"):
             PublicPublisher(own, "tcp://0.0.0.0:*", "")
@@ -141,10 +130,3 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
                 assert stranger.receive(0.2) is None
         with PublicPublisher(own, "", "") as plain:  # free again
             assert plain.public_endpoint == ""
-
-
-def test_missing_numbers_are_counted_camera_by_camera() -> None:
-    missing = MissingFrames()
-    for camera, seq in (("left", 4), ("right", 0), ("left", 7), ("right", 1), ("left", 0), ("left", 1)):
-        missing.note(camera, seq)
-    assert (missing.missed, missing.restarts) == (2, 1)

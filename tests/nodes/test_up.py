@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import signal
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from semantic_mapper.errors import ConfigError
@@ -20,19 +16,17 @@ from tests.nodes.support import (
     Running,
     eventually,
     is_alive,
+    launch_settings,
     refused,
     repeated_frames,
     run,
     run_ok,
+    summary_of,
     write_log,
 )
 from tests.small import tiny_frames
 
 RECORD_LAUNCH = (REPLAY_LAUNCH, "--set", "recorder.enabled=true")
-
-
-def _settings(log: Path, weights: Path, config: Path) -> tuple[str, ...]:
-    return ("--set", f"camera.log={log}", "--set", f"mapper.weights={weights}", "--set", f"mapper.config={config}")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +39,7 @@ def long_log(folder: Path) -> Path:
 def recorded(folder: Path, log: Path, weights: Path, config: Path) -> Path:
     """Results of all three nodes in lockstep."""
     out = folder / "up"
-    done = run_ok("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
+    done = run_ok("up", *RECORD_LAUNCH, *launch_settings(log, weights, config), "--out", out)
     assert "frames fused" in done.stdout
     return out
 
@@ -59,19 +53,21 @@ def test_recorder_keeps_every_frame_byte_for_byte(recorded: Path, log: Path) -> 
 
 
 @pytest.mark.slow
-def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
+def test_ctrl_c_writes_the_map_and_no_process_stays(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
-    with Running("up", *RECORD_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+    with Running(
+        "up", *RECORD_LAUNCH, *launch_settings(long_log, weights, config), "--out", tmp_path / "up"
+    ) as running:
         running.wait_for_line("stream_begins")
         sockets = Path(running.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
         assert sockets.stat().st_mode & 0o777 == 0o700
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
-        assert not any(is_alive(pid) for pid in running.all_pids())
+        assert not any(is_alive(pid) for pid in running.node_pids())
         assert len(running.node_pids()) == 3
         assert not sockets.exists()
-    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "up")
     assert summary["frames"]["fused"] < 600
     assert "stopped" in summary["stopped_by"] or summary["stopped_by"] == "the launcher"
     with LogReader(tmp_path / "up" / "recorded.mcap") as recorded:
@@ -79,10 +75,8 @@ def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
 
 
 @pytest.mark.slow
-def test_nodes_of_a_killed_launcher_write_their_results_and_end(
-    long_log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
-    with Running("up", REPLAY_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+def test_nodes_of_a_killed_launcher_write_results(long_log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
+    with Running("up", REPLAY_LAUNCH, *launch_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
         running.wait_for_line("stream_begins")
         pids = running.node_pids()
         sockets = Path(running.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
@@ -90,21 +84,23 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
         assert eventually(lambda: not any(is_alive(pid) for pid in pids))
     assert sockets.exists()  # who could have removed it?
     (tmp_path / "no-log.mcap").touch()
-    again = run("up", REPLAY_LAUNCH, *_settings(tmp_path / "no-log.mcap", weights, config), "--out", tmp_path / "again")
+    again = run(
+        "up", REPLAY_LAUNCH, *launch_settings(tmp_path / "no-log.mcap", weights, config), "--out", tmp_path / "again"
+    )
     assert again.returncode == 1 and not sockets.exists()  # the next launch
-    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "up")
     assert summary["stopped_by"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "delivery"), [("fast", "all"), ("realtime", "newest")])
-def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
+def test_without_lockstep_frames_are_fused_or_dropped(
     mode: str, delivery: str, weights: Path, config: Path, tmp_path: Path
 ) -> None:
     log = write_log(tmp_path / "forty.mcap", repeated_frames(40))
-    more = ("--set", f"camera.mode={mode}", "--set", f"mapper.delivery={delivery}")
-    run_ok("up", REPLAY_LAUNCH, *_settings(log, weights, config), *more, "--out", tmp_path / "up")
-    frames = json.loads((tmp_path / "up" / "summary.json").read_text())["frames"]
+    settings = launch_settings(log, weights, config, f"camera.mode={mode}", f"mapper.delivery={delivery}")
+    run_ok("up", REPLAY_LAUNCH, *settings, "--out", tmp_path / "up")
+    frames = summary_of(tmp_path / "up")["frames"]
     assert frames["published"] == 40
     assert frames["fused"] >= 1 and frames["fused"] + frames["dropped"] == 40
     assert delivery == "newest" or frames["dropped"] == 0
@@ -117,8 +113,8 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
     skewed[:3, :3] *= 2
     frames[1] = dataclasses.replace(frames[1], T_world_camera=skewed)
     log = write_log(tmp_path / "skewed.mcap", frames)
-    done = run_ok("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
-    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    done = run_ok("up", *RECORD_LAUNCH, *launch_settings(log, weights, config), "--out", tmp_path / "up")
+    summary = summary_of(tmp_path / "up")
     assert summary["frames"]["published"] == 4 and summary["frames"]["fused"] == 3
     assert "frame seq=1" in summary["refusals"][0]["reason"]
     assert "1 frame refused" in done.stdout
@@ -127,41 +123,11 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
 
 
 @pytest.mark.slow
-def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
-    log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "up"
-    assert run("up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out).returncode == 0
-    before = _digests(out)
-    assert "recorded.mcap: exists already" in refused(
-        "up", *RECORD_LAUNCH, *_settings(log, weights, config), "--out", out
-    )
-    assert _digests(out) == before
-
-
-def _digests(folder: Path) -> dict[str, str]:
-    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir() if p.is_file()}
-
-
-@pytest.mark.slow
-def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
-    film, lens = tmp_path / "a film.avi", tmp_path / "lens.toml"
-    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 30, (96, 72))
-    noise = np.random.default_rng(2).integers(0, 255, (72, 96, 3), np.uint8)
-    for shift in range(40):  # more than wait for the mapper while it compiles
-        writer.write(np.roll(noise, shift, axis=1))
-    writer.release()
-    lens.write_text("fx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 35.5\nwidth = 96\nheight = 72\n")
-    rendered = tmp_path / "rendered.toml"  # a fixed camera shows no depth: the field has to guess it
-    rendered.write_text(f'{config.read_text()}\n[depth]\nsource = "sensor"\n')
-    camera = {"kind": "opencv", "config.source": film, "config.calibration": lens, "config.pace": "fast"}
-    settings = [f"camera.{name}={value}" for name, value in {**camera, "poses.kind": "fixed"}.items()]
-    settings += [f"mapper.weights={weights}", f"mapper.config={rendered}"]
-    options = [word for setting in settings for word in ("--set", setting)]
-    out = tmp_path / "out"
-    run_ok("up", REPLAY_LAUNCH, *options, "--out", out)
-    frames = json.loads((out / "summary.json").read_text())["frames"]
-    assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)
+def test_a_recording_that_exists_keeps_it_and_the_map(log: Path, weights: Path, config: Path, recorded: Path) -> None:
+    before = {path.name: path.read_bytes() for path in recorded.iterdir() if path.is_file()}
+    said = refused("up", *RECORD_LAUNCH, *launch_settings(log, weights, config), "--out", recorded)
+    assert "recorded.mcap: exists already" in said
+    assert {path.name: path.read_bytes() for path in recorded.iterdir() if path.is_file()} == before
 
 
 def test_without_a_query_endpoint_there_is_none_and_names_must_differ(tmp_path: Path) -> None:

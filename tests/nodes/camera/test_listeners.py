@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -21,6 +20,7 @@ from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.nodes.mapper.test_query_service import a_folder
 
 PATIENCE_S = 20.0
 TOPICS = ("info", "frame", "end")
@@ -36,7 +36,7 @@ BIG = encode_frame(
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+    with a_folder() as folder:
         yield f"ipc://{folder}/camera"
 
 
@@ -66,12 +66,11 @@ def until_end(subscriber: LosslessSubscriber) -> list[bytes]:
     return topics
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listeners, "REMIND_S", 0.1)
 
 
-@pytest.mark.usefixtures("quick")
 def test_a_live_reader_whose_queue_was_full_at_the_end_hears_of_it(endpoint: str) -> None:
     with (
         Publisher(endpoint, hwm=2) as publisher,
@@ -90,7 +89,6 @@ def test_a_live_reader_whose_queue_was_full_at_the_end_hears_of_it(endpoint: str
             suspended.close()
 
 
-@pytest.mark.usefixtures("quick")
 def test_a_lossless_stream_whose_end_found_no_room_says_it_once_there_is_some(endpoint: str) -> None:
     with (
         Publisher(endpoint, policy="block", hwm=1) as publisher,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,16 +22,15 @@ from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes import publishing
 from semantic_mapper.nodes.camera import live as live_camera
 from semantic_mapper.nodes.camera.node import run_camera
-from semantic_mapper.nodes.launcher.liveness import TURN, HeartbeatWriter
-from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.launcher.liveness import TURN
 from semantic_mapper.nodes.options import CameraOptions, LiveCamera
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.types import PosedFrame
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
 from tests.drivers.support import PATIENCE_S, write_calibration, write_film
-from tests.nodes.support import eventually
+from tests.nodes.mapper.test_query_service import a_folder
+from tests.nodes.support import NodeHere, eventually, node_here
 
 COUNT = 9
 
@@ -54,12 +52,10 @@ def walking(camera: Camera) -> PosedCamera:
 class Running:
     """A camera node in a thread of the test, and what it has published so far."""
 
-    stop: StopRequest
-    thread: threading.Thread
+    node: NodeHere
     heard: list[Message] = field(default_factory=list)
-    error: Exception | None = None
 
-    def until(self, holds: Callable[[Message], bool]) -> Message:
+    def until(self, holds: Callable[[Message], bool]) -> Any:
         """The first message that holds, waited for; those before it count, too."""
         deadline = time.monotonic() + PATIENCE_S
         while (found := next((m for m in list(self.heard) if holds(m)), None)) is None:
@@ -67,28 +63,24 @@ class Running:
             time.sleep(0.01)
         return found
 
+    def until_end(self) -> EndOfStream:
+        end = self.until(lambda m: isinstance(m, EndOfStream))
+        self.node.wait(PATIENCE_S)
+        return end
+
+    def until_status(self, holds: Callable[[Status], bool]) -> Status:
+        return self.until(lambda m: isinstance(m, Status) and holds(m))
+
     def frames(self) -> list[PosedFrame]:
         return [m for m in list(self.heard) if isinstance(m, PosedFrame)]
 
 
 @contextmanager
-def running(
-    options: dict[str, Any], *, restartable: bool = False, beats: int = -1, busy: threading.Event | None = None
-) -> Iterator[Running]:
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:  # pytest's own may be longer than a socket's path
+def running(options: dict[str, Any], *, busy: threading.Event | None = None, **more: Any) -> Iterator[Running]:
+    ended = threading.Event()
+    with a_folder() as folder:
         endpoint = f"ipc://{folder}/eye"
-        stop = StopRequest()
-        context = NodeContext("eye", {"eye": endpoint}, 1, stop, HeartbeatWriter(beats, 1), restartable=restartable)
         checked = convert_config(options, CameraOptions, "test")
-
-        def work() -> None:
-            try:
-                run_camera(context, checked)
-            except Exception as error:  # noqa: BLE001 - looked at by the test
-                node.error = error
-
-        node = Running(stop, threading.Thread(target=work))
-        ended = threading.Event()
 
         def listen() -> None:
             with LosslessSubscriber(endpoint, ("info", "frame", "end", "status"), hwm=2) as subscriber:
@@ -98,21 +90,20 @@ def running(
                         continue
                     message = subscriber.receive(0.05)
                     if message is not None:
-                        node.heard.append(message)
+                        camera.heard.append(message)
                     if isinstance(message, EndOfStream):
                         return
 
         listener = threading.Thread(target=listen)
-        node.thread.start()
-        listener.start()
         try:
-            yield node
+            with node_here(run_camera, "eye", {"eye": endpoint}, checked, **more) as node:
+                camera = Running(node)
+                listener.start()
+                yield camera
         finally:
-            stop.signum = 15
-            node.thread.join(PATIENCE_S)
             ended.set()
             listener.join(PATIENCE_S)
-            assert not node.thread.is_alive() and not listener.is_alive()
+        assert not listener.is_alive()
 
 
 @pytest.fixture(autouse=True)
@@ -135,18 +126,16 @@ def test_a_video_file_is_published_to_its_end(tmp_path: Path) -> None:
     film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), (20 * k, 0, 0), np.uint8) for k in range(COUNT)])
     config = tmp_path / "film.toml"
     config.write_text(f'source = "{film}"\ncalibration = "{write_calibration(tmp_path / "lens.toml")}"\n')
-    with running({"camera": {"kind": "opencv", "config": str(config), "poses": {"kind": "walk"}}}) as node:
-        end = node.until(lambda m: isinstance(m, EndOfStream))
-        info = node.until(lambda m: isinstance(m, StreamInfo))
-        node.thread.join(PATIENCE_S)
-    assert isinstance(end, EndOfStream) and (end.reason, end.published, end.source) == ("end", 6, "eye")
-    assert isinstance(info, StreamInfo) and info.source == "video film.avi" and list(info.cameras) == ["camera"]
-    frames = node.frames()
+    with running({"camera": {"kind": "opencv", "config": str(config), "poses": {"kind": "walk"}}}) as camera:
+        end = camera.until_end()
+        info = camera.until(lambda m: isinstance(m, StreamInfo))
+    assert (end.reason, end.published, end.source) == ("end", 6, "eye")
+    assert info.source == "video film.avi" and list(info.cameras) == ["camera"]
+    frames = camera.frames()
     assert [f.seq for f in frames] == [0, 1, 3, 4, 6, 7]
     assert [f.T_world_camera[0, 3] for f in frames] == [0, 1, 3, 4, 6, 7]
     assert all(f.pose_source == "walk" and f.pose_sigma == 0.1 for f in frames)
     assert frames[4].rgb[..., 0].mean() == pytest.approx(120, abs=5)
-    assert node.error is None
 
 
 def long_film(tmp_path: Path) -> dict[str, Any]:
@@ -161,20 +150,20 @@ def long_film(tmp_path: Path) -> dict[str, Any]:
 def test_a_video_file_waits_for_a_reader_that_must_not_lose_a_frame(tmp_path: Path) -> None:
     busy = threading.Event()
     busy.set()
-    with running(long_film(tmp_path), busy=busy) as node:
+    with running(long_film(tmp_path), busy=busy) as camera:
         time.sleep(1.0)  # a mapper that compiles
-        assert node.thread.is_alive()
+        assert camera.node.thread.is_alive()
         busy.clear()
-        end = node.until(lambda m: isinstance(m, EndOfStream))
-    assert isinstance(end, EndOfStream) and (end.reason, end.published) == ("end", 40)
-    assert [f.seq for f in node.frames()] == [n for n in range(60) if n % 3 != 2]
+        end = camera.until_end()
+    assert (end.reason, end.published) == ("end", 40)
+    assert [f.seq for f in camera.frames()] == [n for n in range(60) if n % 3 != 2]
     busy.set()
-    with running(long_film(tmp_path), busy=busy) as stopped:
-        time.sleep(0.5)
-    assert node.error is None and stopped.error is None
-    with running(long_film(tmp_path) | {"ack_timeout_s": 0.5}, busy=busy) as node:
-        assert eventually(lambda: isinstance(node.error, TransportError), PATIENCE_S)
-    assert "taken no frame for 0.5 s" in str(node.error)
+    with running(long_film(tmp_path), busy=busy):
+        time.sleep(0.5)  # and is stopped
+    with running(long_film(tmp_path) | {"ack_timeout_s": 0.5}, busy=busy, fails=True) as camera:
+        camera.node.wait(PATIENCE_S)
+    assert isinstance(camera.node.error, TransportError)
+    assert "taken no frame for 0.5 s" in str(camera.node.error)
 
 
 @pytest.mark.parametrize(
@@ -193,19 +182,16 @@ def test_loops_are_closed_only_where_the_map_is_told_of_them(
     closes: bool,
     says: str,
 ) -> None:
-    opened: list[dict[str, Any]] = []
+    opened: list[Any] = []
 
     def with_poses(camera: Camera, live: LiveCamera, driver: dict[str, Any]) -> PosedCamera:
-        assert isinstance(live.poses, dict)
         opened.append(live.poses)
         return walking(camera)
 
     monkeypatch.setattr(live_camera, "with_poses", with_poses)
-    camera = long_film(tmp_path)["camera"] | {"poses": poses}
-    with running({"camera": camera, **options}) as node:
-        status = node.until(lambda m: isinstance(m, Status))
+    with running({"camera": long_film(tmp_path)["camera"] | {"poses": poses}, **options}) as camera:
+        status = camera.until_status(lambda _: True)
     assert opened[-1].get("loop_closure", True) == closes
-    assert isinstance(status, Status)
     told = [w for w in status.degraded if "loop closure" in w]
     assert told == [] if not says else len(told) == 1 and says in told[0]
 
@@ -214,68 +200,63 @@ def test_loops_are_closed_only_where_the_map_is_told_of_them(
 def test_a_camera_that_cannot_be_found_again_must_not_come_back_in_another_world(tmp_path: Path, start: object) -> None:
     poses = {"kind": "visual"} if start is None else {"kind": "rgbd", "T_world_start": start}
     camera = v4l2(tmp_path / "video0", tmp_path)["camera"] | {"poses": poses}
-    with running({"camera": camera}, restartable=True) as node:
-        node.thread.join(PATIENCE_S)
-    assert isinstance(node.error, ConfigError) and 'set restart = "never"' in str(node.error)
-    assert not node.frames()
+    with running({"camera": camera}, restartable=True, fails=True) as running_camera:
+        running_camera.node.wait(PATIENCE_S)
+    error = running_camera.node.error
+    assert isinstance(error, ConfigError) and 'set restart = "never"' in str(error)
+    assert not running_camera.frames()
 
 
-def test_frames_get_the_poses_that_the_launch_file_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Settings of a film; its camera has the poses of the launch file."""
     monkeypatch.undo()  # of the walking camera
-    film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 90, np.uint8)] * COUNT)
+    images = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 90, np.uint8)] * COUNT)
+    return {"source": str(images), "calibration": str(write_calibration(tmp_path / "lens.toml"))}
+
+
+def test_frames_get_the_poses_that_the_launch_file_names(film: dict[str, str]) -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1.0, -2.0, 0.5
-    camera = {
-        "kind": "opencv",
-        "id": "wall",
-        "config": {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")},
-        "poses": {"kind": "fixed", "T_world_camera": pose.tolist()},
-    }
-    with running({"camera": camera}) as node:
-        node.until(lambda m: isinstance(m, EndOfStream))
-    frames = node.frames()
-    assert node.error is None and [f.seq for f in frames] == list(range(COUNT))
+    poses = {"kind": "fixed", "T_world_camera": pose.tolist()}
+    with running({"camera": {"kind": "opencv", "id": "wall", "config": film, "poses": poses}}) as camera:
+        camera.until_end()
+    frames = camera.frames()
+    assert [f.seq for f in frames] == list(range(COUNT))
     assert all((f.camera_id, f.pose_source, f.pose_sigma) == ("wall", "fixed", 0.0) for f in frames)
     assert all(np.array_equal(f.T_world_camera, pose) for f in frames)
 
 
 @pytest.mark.parametrize("restartable", [False, True])
-def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restartable: bool
+def test_a_failure_of_what_restarts_ends_no_stream(
+    film: dict[str, str], monkeypatch: pytest.MonkeyPatch, restartable: bool
 ) -> None:
-    monkeypatch.undo()  # of the walking camera
-    film = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 90, np.uint8)] * COUNT)
-    config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
     poses = {"kind": "device"}  # a video gives no pose of its own
     monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
-    with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, restartable=restartable) as node:
-        node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
-        ends = [m for m in list(node.heard) if isinstance(m, EndOfStream)]
-    assert isinstance(node.error, CameraError)
-    assert [end.reason for end in ends] == ([] if restartable else ["error"])
+    options = {"camera": {"kind": "opencv", "config": film, "poses": poses}}
+    with running(options, restartable=restartable, fails=True) as camera:
+        camera.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
+        ends = [m.reason for m in list(camera.heard) if isinstance(m, EndOfStream)]
+    assert isinstance(camera.node.error, CameraError) and ends == ([] if restartable else ["error"])
 
 
 def test_it_stays_when_the_camera_goes_says_so_and_goes_on_when_it_is_back(machine: Machine, tmp_path: Path) -> None:
     sensor = Sensor()
-    with running(v4l2(machine.plug(sensor, 0), tmp_path)) as node:
-        before = node.until(lambda m: isinstance(m, PosedFrame))
-        assert isinstance(before, PosedFrame)
+    with running(v4l2(machine.plug(sensor, 0), tmp_path)) as camera:
+        before = camera.until(lambda m: isinstance(m, PosedFrame))
         machine.unplug(sensor)
-        gone = node.until(lambda m: isinstance(m, Status) and m.state == "degraded")
-        assert isinstance(gone, Status)
-        last_before = node.frames()[-1].stamp_ns
+        gone = camera.until_status(lambda s: s.state == "degraded")
+        last_before = camera.frames()[-1].stamp_ns
         machine.plug(sensor, 4)
-        back = node.until(lambda m: isinstance(m, PosedFrame) and m.stamp_ns > last_before)
-        well = node.until(lambda m: isinstance(m, Status) and m.state == "running" and m.stamp_ns > gone.stamp_ns)
-        node.stop.signum = 15
-        end = node.until(lambda m: isinstance(m, EndOfStream))
-        node.thread.join(PATIENCE_S)
+        back = camera.until(lambda m: isinstance(m, PosedFrame) and m.stamp_ns > last_before)
+        well = camera.until_status(lambda s: s.state == "running" and s.stamp_ns > gone.stamp_ns)
+        camera.node.stop.signum = 15
+        end = camera.until_end()
     assert any("no such camera" in t or "gone" in t for t in gone.degraded) and gone.counters["published"] >= 1
-    assert isinstance(back, PosedFrame) and back.seq > before.seq + 1 and back.camera_id == "front"
-    assert isinstance(well, Status) and well.degraded == () and well.ages_s["frame"] < PATIENCE_S
+    assert back.seq > before.seq + 1 and back.camera_id == "front"
+    assert well.degraded == () and well.ages_s["frame"] < PATIENCE_S
     assert {"published", "missing", "no_pose"} <= set(well.counters)
-    assert isinstance(end, EndOfStream) and end.reason == "stopped" and end.published >= len(node.frames())
-    assert node.error is None
+    assert end.reason == "stopped" and end.published >= len(camera.frames())
 
 
 def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(machine: Machine, tmp_path: Path) -> None:
@@ -293,25 +274,24 @@ def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(mach
         turns()  # those of before do not count
         return eventually(turns, 1.0)
 
-    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path, stall_s=1.0), beats=theirs) as node:
-        node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
+    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path, stall_s=1.0), beats=theirs) as camera:
+        camera.until_status(lambda s: s.state == "starting" and bool(s.degraded))
         assert goes_on(), "it waits for a camera that has never been there"
         machine.plug(sensor, 0)
-        node.until(lambda m: isinstance(m, PosedFrame))
+        camera.until(lambda m: isinstance(m, PosedFrame))
         assert goes_on()
         sensor.stalled = True
-        node.until(lambda m: isinstance(m, Status) and m.state == "degraded")
+        camera.until_status(lambda s: s.state == "degraded")
         assert goes_on(), "nothing comes, but the driver says so"
         machine.unplug(sensor)
-        node.until(lambda m: isinstance(m, Status) and any("no such camera" in t for t in m.degraded))
+        camera.until_status(lambda s: any("no such camera" in t for t in s.degraded))
         assert goes_on(), "it waits for a camera that is away"
         sensor.stalled, sensor.hangs = False, returns
         machine.plug(sensor, 4)
         assert eventually(lambda: sensor.opens > 1 and not goes_on(), PATIENCE_S), "a read that never returns"
-        assert node.thread.is_alive()
+        assert camera.node.thread.is_alive()
         returns.set()
         assert goes_on()
-    assert node.error is None
     os.close(beats)
     os.close(theirs)
 
@@ -319,21 +299,19 @@ def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(mach
 def test_patience_with_a_camera_can_be_limited(machine: Machine, tmp_path: Path) -> None:
     options = v4l2(machine.dev / "video0", tmp_path)
     options["camera"]["open_s"] = 0.3
-    with running(options) as node:
-        assert eventually(lambda: not node.thread.is_alive(), PATIENCE_S)
-    assert isinstance(node.error, CameraError) and "is it plugged in" in str(node.error)
+    with running(options, fails=True) as camera:
+        camera.node.wait(PATIENCE_S)
+    assert isinstance(camera.node.error, CameraError) and "is it plugged in" in str(camera.node.error)
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
+def test_options_name_a_log_or_a_camera_with_poses() -> None:
+    camera = {"kind": "v4l2", "poses": {}}
+    for options, says in (
         ({}, "either a log or a camera"),
-        ({"log": "a.mcap", "camera": {"kind": "v4l2", "poses": {}}}, "either a log or a camera"),
+        ({"log": "a.mcap", "camera": camera}, "either a log or a camera"),
         ({"camera": {"kind": "v4l2"}}, "poses"),
-        ({"camera": {"kind": "v4l2", "poses": {}, "id": "a/b"}}, "camera.id"),
+        ({"camera": camera | {"id": "a/b"}}, "camera.id"),
         ({"log": ""}, "log"),
-    ],
-)
-def test_options_name_a_log_or_a_camera_with_poses(options: dict[str, Any], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        convert_config(options, CameraOptions, "test")
+    ):
+        with pytest.raises(ConfigError, match=says):
+            convert_config(options, CameraOptions, "test")

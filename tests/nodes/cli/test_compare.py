@@ -9,9 +9,7 @@ from pathlib import Path
 from tests.nodes.support import refused, run, run_ok
 
 
-def test_equal_different_and_what_cannot_be_compared_have_exit_codes(
-    replayed: Path, log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
+def test_each_outcome_has_an_exit_code(replayed: Path, log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     copy, fewer = shutil.copytree(replayed, tmp_path / "copy"), tmp_path / "fewer"
     assert json.loads(run_ok("compare", replayed, copy, "--exact", "--json").stdout)["equal"]
     run_ok("replay", log, "--out", fewer, "--weights", weights, "--config", config, "--max-frames", "5")

@@ -49,9 +49,7 @@ def test_what_is_no_film_is_refused_but_not_before_missing_weights_are(tmp_path:
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_a_recording_without_any_depth_is_mapped_with_the_weights_for_computed_depth(
-    tmp_path: Path, depth: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_without_any_depth_other_weights_map(tmp_path: Path, depth: bool, capfd: pytest.CaptureFixture[str]) -> None:
     folder = rec.make_folder(tmp_path / "kitchen")
     if not depth:
         shutil.rmtree(folder / "depth")

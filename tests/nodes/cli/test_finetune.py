@@ -49,9 +49,7 @@ def test_finetuned_weights_remember_their_keyframes_and_those_before(log: Path, 
     assert checkpoint.train_stamps_ns <= again.train_stamps_ns and len(again.anchors) == 2
 
 
-def test_logs_with_too_few_labels_and_weights_without_classes_are_refused(
-    log: Path, weights: Path, tmp_path: Path
-) -> None:
+def test_too_few_labels_and_weights_without_classes_are_refused(log: Path, weights: Path, tmp_path: Path) -> None:
     plain, out = tmp_path / "plain.mcap", tmp_path / "made"
     with LogWriter(plain, StreamInfo(source="test", cameras={"rooms": INTRINSICS})) as writer:
         writer.write_frame(tiny_frames(1)[0])
@@ -74,7 +72,7 @@ def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_pat
     assert json.loads(file.read_text())["replays"]["replayed"] == summary_of(replayed)
 
 
-def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_to(
+def test_eval_compares_on_frames_that_nobody_was_fitted_to(
     log: Path, tuned: Path, config: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "eval.json"
@@ -85,9 +83,7 @@ def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_
     assert {"sray", "per-image U-Net", "labels carried by depth"} <= set(scores["methods"])
 
 
-def test_eval_scores_the_map_with_its_things_where_objects_are_known(
-    log: Path, weights: Path, config: Path, tmp_path: Path
-) -> None:
+def test_eval_scores_things_where_objects_are_known(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     for number, frame in enumerate(tiny_frames(6)[:2]):
         cv2.imwrite(str(tmp_path / f"{number:06d}.png"), (frame.label // 3).astype(np.uint16))
     file, options = tmp_path / "eval.json", ("--weights", weights, "--config", config, "--max-frames", "2")
@@ -98,9 +94,7 @@ def test_eval_scores_the_map_with_its_things_where_objects_are_known(
     assert run("eval", tmp_path, "--instances", tmp_path).returncode == 2
 
 
-def test_a_grid_of_a_scene_needs_no_labels_and_claims_none_in_a_replay(
-    log: Path, settings: Path, tmp_path: Path
-) -> None:
+def test_a_grid_needs_no_labels_and_claims_none_in_a_replay(log: Path, settings: Path, tmp_path: Path) -> None:
     out = tmp_path / "grid.safetensors"
     arguments = ("--kind", "grid", "--steps", "20", "--seconds", "0", "--config", settings)
     assert "grid: 20 steps" in run_ok("finetune", log, *arguments, "--out", out).stdout
@@ -112,9 +106,7 @@ def test_a_grid_of_a_scene_needs_no_labels_and_claims_none_in_a_replay(
     assert summary["metrics"]["coverage"] == 0.0 and summary["map"]["unknown"] == 1.0  # no class is claimed
 
 
-def test_ctrl_c_keeps_the_grid_so_far(
-    log: Path, settings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_keeps_the_best_grid(log: Path, settings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, notes, show = tmp_path / "early.safetensors", [], FrameProgress.set
     settings.write_text(GRID + "steps = 1_000_000\n")
 
@@ -132,9 +124,7 @@ def test_ctrl_c_keeps_the_grid_so_far(
     assert 0 < checkpoint.recipe["steps"] < 1000 and checkpoint.recipe["seconds"] < 500
 
 
-def test_a_field_of_one_scene_labels_its_log_and_maps_it(
-    log: Path, config: Path, settings: Path, tmp_path: Path
-) -> None:
+def test_a_field_of_a_scene_labels_its_log_and_maps_it(log: Path, config: Path, settings: Path, tmp_path: Path) -> None:
     out, again = tmp_path / "irt.safetensors", tmp_path / "again.safetensors"
     arguments = ("--kind", "irt", "--steps", "16", "--seconds", "0", "--config", settings)
     said = run_ok("finetune", log, *arguments, "--set", "irt.variant=RTTC", "--keyframes", "2", "--out", out).stdout

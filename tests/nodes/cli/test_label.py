@@ -94,7 +94,6 @@ def test_the_page_is_served_until_it_is_stopped_and_says_what_came_of_it(log: Pa
     out, classes = tmp_path / "labels", tmp_path / "classes.txt"
     classes.write_text("wall\nfloor\n")
     with Running("label", log, "--serve", "--out", out, "--classes", classes, "--suggest", "2", "--port", "0") as page:
-        assert page.process.stdout is not None
         url = page.process.stdout.readline().removeprefix("label at ").strip()
         with urllib.request.urlopen(f"{url}session", timeout=60) as answer:
             session = json.load(answer)

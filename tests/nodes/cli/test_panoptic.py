@@ -16,7 +16,7 @@ from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
-from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource, choose_frames, open_pseudo_labels
+from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource, open_pseudo_labels
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.config import FinetuneConfig
@@ -68,7 +68,7 @@ def fitted(log: Path, boxes: Path, settings: Path, folder: Path) -> tuple[Path, 
     return out, " ".join(done.stdout.split())
 
 
-def test_boxes_become_labels_and_things_that_never_score(
+def test_boxes_become_labels_that_never_score(
     log: Path, fitted: tuple[Path, str], config: Path, tmp_path: Path
 ) -> None:
     (out, said), new = fitted, tmp_path / "labelled.mcap"
@@ -112,13 +112,6 @@ def test_a_stop_leaves_no_images_of_things(log: Path, fitted: tuple[Path, str], 
     things.mkdir()
     with pytest.raises(LogError, match="things: exists already"):
         autolabel_log(request)
-
-
-def test_frames_with_labels_go_before_others() -> None:
-    assert choose_frames(10, 4, None) == choose_frames(10, 4, frozenset(range(10))) == [0, 3, 6, 9]
-    assert choose_frames(10, 4, frozenset((1, 2, 3))) == [0, 1, 2, 3]
-    assert choose_frames(10, 2, frozenset((1, 2, 3, 8))) == [1, 8]
-    assert choose_frames(3, 9, frozenset((1,))) == [0, 1, 2]
 
 
 def test_boxes_that_do_not_fit_are_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:

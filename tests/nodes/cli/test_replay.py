@@ -36,9 +36,7 @@ def test_missing_weights_unknown_settings_and_bad_corrections_are_named(log: Pat
         assert said in refused("replay", log, "--out", tmp_path / "out", option, file)
 
 
-def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
-    tmp_path: Path, weights: Path, config: Path
-) -> None:
+def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
     frames = list(tiny_frames(6))
     skewed = frames[1].T_world_camera.copy()
     skewed[:3, :3] *= 1.5

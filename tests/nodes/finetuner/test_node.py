@@ -8,24 +8,21 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import cv2
-import msgspec
 import pytest
 
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.finetuner import finetuner
 from semantic_mapper.nodes.finetuner.__main__ import run as run_finetuner
 from semantic_mapper.nodes.finetuner.finetuner import FinetuneRound
-from semantic_mapper.nodes.launcher.launch_file import load_launch
-from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
+from semantic_mapper.nodes.options import FinetunerOptions
 from semantic_mapper.nodes.process import run_when_idle
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.fit import FitProgress
@@ -35,7 +32,7 @@ from semantic_mapper.transport.messages import LabelledKeyframe, Status, Weights
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_query_service import a_folder
-from tests.nodes.support import REPLAY_LAUNCH, eventually, node_here, run_here, write_log
+from tests.nodes.support import eventually, node_here, run_ok, write_log
 from tests.small import tiny_frames
 from tests.training.test_online import permuted, start_of
 
@@ -65,13 +62,19 @@ class Heard:
     def __init__(self, endpoints: dict[str, str], weights: LosslessSubscriber, status: NewestSubscriber) -> None:
         self.endpoints = endpoints
         self._weights, self._status = weights, status
-        self.last: Status | None = None
+        self.last = Status("finetuner", "starting", 0)
 
     def counters(self) -> dict[str, int]:
         while (message := self._status.receive(0.02)) is not None:
-            assert isinstance(message, Status)
             self.last = message
-        return {} if self.last is None else dict(self.last.counters)
+        return dict(self.last.counters)
+
+    def until(self, **wanted: int) -> None:
+        """Waits until the counters are these."""
+        assert eventually(lambda: wanted.items() <= self.counters().items()), (wanted, self.last)
+
+    def until_warned(self, text: str) -> None:
+        assert eventually(lambda: self.counters() and text in "".join(self.last.degraded[-1:])), (text, self.last)
 
     def update(self) -> WeightsUpdate:
         message = self._weights.receive(120)
@@ -102,19 +105,32 @@ def finetuning(
         yield Heard(endpoints, weights, status)
 
 
-@contextmanager
-def played_mapper(start: Path) -> Iterator[tuple[Heard, Publisher]]:
-    """A finetuner whose mapper is a publisher of the test's."""
+class PlayedMapper(NamedTuple):
+    """What a finetuner hears of a mapper, said by the test."""
+
+    publisher: Publisher
+    endpoints: dict[str, str]
+
+    def says(self, version: int, digest: str, *judged: int, **more: Any) -> None:
+        self.publisher.publish(encode(WeightsInUse("mapper", version, digest, *judged, **more)))
+
+
+@pytest.fixture
+def mapper(start: Path) -> Iterator[PlayedMapper]:
+    """It has the weights to start from."""
     with a_folder() as folder:
         endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
-        with Publisher(endpoints["mapper"]) as mapper, finetuning(start, endpoints) as heard:
-            mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
-            yield heard, mapper
+        with Publisher(endpoints["mapper"]) as publisher:
+            mapper = PlayedMapper(publisher, endpoints)
+            mapper.says(0, digest_of(start.read_bytes()))
+            yield mapper
 
 
 @pytest.mark.slow
-def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start: Path, tmp_path: Path) -> None:
-    with played_mapper(start) as (heard, mapper):
+def test_keyframes_become_weights_and_the_mapper_has_the_last_word(
+    start: Path, mapper: PlayedMapper, tmp_path: Path
+) -> None:
+    with finetuning(start, mapper.endpoints) as heard:
         wide = dataclasses.replace(FRAMES[0], label=FRAMES[0].label + 200)
         heard.teach([wide, *FRAMES[:4]])
         first = heard.update()
@@ -123,75 +139,67 @@ def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start:
         (tmp_path / "first.safetensors").write_bytes(first.data)
         made = load_checkpoint(tmp_path / "first.safetensors")
         assert made.recipe["kind"] == "online" and made.recipe["parent"] == first.parent and made.recipe["version"] == 1
-        assert eventually(lambda: heard.counters().get("offered") == 1 and heard.counters()["unusable"] == 1)
-        mapper.publish(encode(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
-        assert eventually(lambda: heard.counters().get("taken") == 1 and heard.counters()["new"] == 0)
+        heard.until(offered=1, unusable=1)
+        mapper.says(1, first.digest, 1, 1, accepted=True)
+        heard.until(taken=1, new=0)
         # Labels that contradict those which have proved right: rejected here, and forgotten.
         heard.teach([permuted(f) for f in FRAMES[4:]], "bad")
-        assert eventually(lambda: heard.counters().get("refused") == 1)
-        assert heard.counters()["set_aside"] == 4 and heard.counters()["kept"] == 4
-        assert heard.last is not None and "the last weights were refused" in heard.last.degraded[0]
+        heard.until(refused=1, set_aside=4, kept=4)
+        assert "the last weights were refused" in heard.last.degraded[0]
         # Going back: keyframes that only those weights were made with are forgotten, too.
-        mapper.publish(encode(WeightsInUse("mapper", 0, first.parent, 1, 1, accepted=True, rolled_back=1)))
-        assert eventually(lambda: heard.counters().get("kept") == 0)
+        mapper.says(0, first.parent, 1, 1, accepted=True, rolled_back=1)
+        heard.until(kept=0)
         heard.teach(FRAMES[:4])
         second = heard.update()
         assert (second.version, second.parent) == (2, first.parent)
-        refusal = WeightsInUse("mapper", 0, first.parent, 2, 2, accepted=False, reason="no", rolled_back=1)
-        mapper.publish(encode(msgspec.structs.replace(refusal, contradicts=True)))
-        assert eventually(lambda: heard.counters().get("refused") == 2 and heard.counters()["kept"] == 0)
-        mapper.publish(encode(WeightsInUse("mapper", 0, "ab" * 32, 2, 2, reason="no", rolled_back=1)))
-        assert eventually(lambda: heard.counters() and "does not know" in heard.last.degraded[-1])  # pyright: ignore
+        mapper.says(0, first.parent, 2, 2, accepted=False, reason="no", rolled_back=1, contradicts=True)
+        heard.until(refused=2, kept=0)
+        mapper.says(0, "ab" * 32, 2, 2, reason="no", rolled_back=1)
+        heard.until_warned("does not know")
 
 
 @pytest.mark.slow
-def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one_before(start: Path, tmp_path: Path):
+def test_a_restarted_finetuner_goes_on_where_it_was(start: Path, mapper: PlayedMapper, tmp_path: Path) -> None:
     config, out = tmp_path / "learning.toml", tmp_path / "out"
     config.write_text("least_gain = 0.0\n" + LEARNING, encoding="utf-8")
     kept = out / "weights" / "000001.safetensors"
-    with a_folder() as folder:
-        endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
 
-        def runs(restarts: int):
-            return finetuning(start, endpoints, restarts, out=str(out), config=str(config))
+    def runs(restarts: int):
+        return finetuning(start, mapper.endpoints, restarts, out=str(out), config=str(config))
 
-        with Publisher(endpoints["mapper"]) as mapper:
-            with runs(0) as heard:
-                mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
-                heard.teach(FRAMES[:4])
-                first = heard.update()
-                kept.parent.mkdir()
-                kept.write_bytes(first.data)  # as a mapper does
-                mapper.publish(encode(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
-                assert eventually(lambda: heard.counters().get("taken") == 1)
-                heard.teach(FRAMES[4:6])
-                assert eventually(lambda: heard.counters()["kept"] == 6)
-            assert len(list((out / "learning").glob("*.keyframe"))) == 6
-            with runs(1) as heard:
-                assert eventually(lambda: heard.counters().get("kept") == 6)
-                assert heard.counters()["new"] == 2 and not heard.last.degraded  # pyright: ignore
-                heard.teach(FRAMES[6:8])
-                second = heard.update()
-                assert (second.version, second.parent) == (2, first.digest)
-                assert (second.keyframes, second.held_out) == (6, 2)
-            # Neither weights nor keyframes are taken on trust.
-            kept.write_bytes(first.data[:-1] + b"x")
-            damaged = sorted((out / "learning").glob("*.keyframe"))[0]
-            damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
-            with runs(2) as heard:
-                assert eventually(lambda: heard.counters().get("kept") == 7)
-                assert "does not know" in heard.last.degraded[-1]  # pyright: ignore
-            with runs(0) as heard:  # another launch
-                assert eventually(lambda: heard.counters().get("kept") == 0)
-                assert not list((out / "learning").glob("*.keyframe"))
-            with runs(0) as heard:
-                assert eventually(lambda: heard.counters().get("kept") == 0)
-            (earlier,) = out.glob("learning-earlier-*")
-            assert len(list(earlier.glob("*.keyframe"))) == 7, "which people may have labelled"
+    with runs(0) as heard:
+        heard.teach(FRAMES[:4])
+        first = heard.update()
+        kept.parent.mkdir()
+        kept.write_bytes(first.data)  # as a mapper does
+        mapper.says(1, first.digest, 1, 1, accepted=True)
+        heard.until(taken=1)
+        heard.teach(FRAMES[4:6])
+        heard.until(kept=6)
+    assert len(list((out / "learning").glob("*.keyframe"))) == 6
+    with runs(1) as heard:
+        heard.until(kept=6, new=2)
+        assert not heard.last.degraded
+        heard.teach(FRAMES[6:8])
+        second = heard.update()
+        assert (second.version, second.parent, second.keyframes, second.held_out) == (2, first.digest, 6, 2)
+    # Neither weights nor keyframes are taken on trust.
+    kept.write_bytes(first.data[:-1] + b"x")
+    damaged = sorted((out / "learning").glob("*.keyframe"))[0]
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    with runs(2) as heard:
+        heard.until(kept=7)
+        heard.until_warned("does not know")
+    for _ in range(2):
+        with runs(0) as heard:  # another launch
+            heard.until(kept=0)
+        assert not list((out / "learning").glob("*.keyframe"))
+    (earlier,) = out.glob("learning-earlier-*")
+    assert len(list(earlier.glob("*.keyframe"))) == 7, "which people may have labelled"
 
 
 def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
-    start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: Path, mapper: PlayedMapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learn, under_way, go_on = finetuner.learn, threading.Event(), threading.Event()
 
@@ -201,47 +209,34 @@ def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory\nmore of it")
 
     monkeypatch.setattr(finetuner, "learn", dies)
-    with a_folder() as folder:
-        endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
-        with Publisher(endpoints["mapper"]) as mapper:
-            mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
-            with finetuning(start, endpoints, out=str(tmp_path / "out"), retry_s=60.0) as heard:
-                heard.teach(FRAMES[:4])
-                assert under_way.wait(60) and eventually(lambda: heard.counters()["learning"] == 1)
-                shutil.copytree(tmp_path / "out", tmp_path / "killed")
-                go_on.set()
-                assert eventually(lambda: heard.counters().get("failed") == 1)
-                assert (heard.counters()["kept"], heard.counters()["set_aside"]) == (4, 0)
-                assert heard.last is not None and "RuntimeError: DefaultCPUAllocator" in heard.last.degraded[-1]
-                assert "its keyframes are kept, next try in" in heard.last.degraded[-1]
-            monkeypatch.setattr(finetuner, "learn", learn)
-            with finetuning(start, endpoints, 1, out=str(tmp_path / "killed"), retry_s=0.5) as heard:
-                update = heard.update()
-                assert (update.keyframes, update.held_out) == (3, 1) and heard.counters()["failed"] == 1
-                # What hinders the mapper from taking weights says nothing about the labels, either.
-                refusal = WeightsInUse("mapper", 0, update.parent, 1, 1, reason="000001.safetensors: no space left")
-                mapper.publish(encode(refusal))
-                assert eventually(lambda: heard.counters()["failed"] == 2)
-                assert (heard.counters()["kept"], heard.counters()["refused"]) == (4, 1)
+    with finetuning(start, mapper.endpoints, out=str(tmp_path / "out"), retry_s=60.0) as heard:
+        heard.teach(FRAMES[:4])
+        assert under_way.wait(60)
+        heard.until(learning=1)
+        shutil.copytree(tmp_path / "out", tmp_path / "killed")
+        go_on.set()
+        heard.until(failed=1, kept=4, set_aside=0)
+        assert "RuntimeError: DefaultCPUAllocator" in heard.last.degraded[-1]
+        assert "its keyframes are kept, next try in" in heard.last.degraded[-1]
+    monkeypatch.setattr(finetuner, "learn", learn)
+    with finetuning(start, mapper.endpoints, 1, out=str(tmp_path / "killed"), retry_s=0.5) as heard:
+        update = heard.update()
+        assert (update.keyframes, update.held_out) == (3, 1)
+        heard.until(failed=1)
+        # What hinders the mapper from taking weights says nothing about the labels, either.
+        mapper.says(0, update.parent, 1, 1, reason="000001.safetensors: no space left")
+        heard.until(failed=2, kept=4, refused=1)
 
 
 def test_learning_has_only_what_is_left_over_of_the_processors_and_all_else_its_turn() -> None:
-    found: list[int] = []
-
-    def work() -> None:
-        run_when_idle()
-        inner = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0)))
-        inner.start()
-        inner.join()
-
-    worker = threading.Thread(target=work)
-    worker.start()
-    worker.join()
-    assert found == [os.SCHED_IDLE] and os.sched_getscheduler(0) == os.SCHED_OTHER
+    with ThreadPoolExecutor(1) as worker:
+        worker.submit(run_when_idle).result()
+        assert worker.submit(os.sched_getscheduler, 0).result() == os.SCHED_IDLE
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
-def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
-    start: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_round_without_a_processor_holds_nothing_up(
+    start: Path, mapper: PlayedMapper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     under_way, go_on = threading.Event(), threading.Event()
 
@@ -253,14 +248,13 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
     monkeypatch.setattr(finetuner, "learn", starves)
     monkeypatch.setattr(finetuner, "GIVE_UP_S", 0.1)
     try:
-        with played_mapper(start) as (heard, mapper):
+        with finetuning(start, mapper.endpoints) as heard:
             heard.teach(FRAMES[:4])
             assert under_way.wait(60)
-            mapper.publish(encode(WeightsInUse("mapper", 1, "ab" * 32, 1, 1)))  # the round is given up
-            assert eventually(lambda: bool(heard.counters() and heard.last.degraded), 20)  # pyright: ignore
-            assert "does not know" in heard.last.degraded[-1]  # pyright: ignore
+            mapper.says(1, "ab" * 32, 1, 1)  # the round is given up
+            heard.until_warned("does not know")
             heard.teach(FRAMES[4:6])
-            assert eventually(lambda: heard.counters()["kept"] == 6, 20) and heard.counters()["learning"] == 1
+            heard.until(kept=6, learning=1)
     finally:
         go_on.set()
 
@@ -273,10 +267,10 @@ def test_a_mapper_learns_while_it_maps_from_what_the_command_line_labels(start: 
     with running_robot(start, tmp_path / "out", 0, learner="finetuner") as robot:
         with finetuning(start, robot.endpoints) as heard:
             robot.send(list(FRAMES[:2]))
-            code, text = run_here("label", log, "--images", images, "--to", robot.endpoints["labels"])
-            assert code == 0 and "4 labelled keyframes sent: frames 4, 5, 6, 7 of room.mcap" in text, text
+            said = run_ok("label", log, "--images", images, "--to", robot.endpoints["labels"]).stdout
+            assert "4 labelled keyframes sent: frames 4, 5, 6, 7 of room.mcap" in " ".join(said.split())
             assert eventually(lambda: robot.status[-1].counters.get("weights_version") == 1)
-            assert eventually(lambda: heard.counters().get("taken") == 1)
+            heard.until(taken=1)
             robot.send(list(FRAMES[2:6]))
         summary = robot.end(6)
     assert summary["weights"]["learned"]["taken"] == 1 and summary["weights"]["recipe"] == "online"
@@ -307,21 +301,3 @@ def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytes
     under_way.cancelled.set()
     under_way.thread.join(60)
     assert not under_way.thread.is_alive() and under_way.result is None
-
-
-@pytest.mark.parametrize("given", [["camera.log=kitchen.mcap", "camera.mode=realtime"], ["finetuner.niceness=18"]])
-def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(given: list[str], tmp_path: Path) -> None:
-    path = REPLAY_LAUNCH.with_name("learning.toml")
-    launch = load_launch(path, [*given, "finetuner.cpu_fraction=0.25"], tmp_path)
-    options = launch.options["finetuner"]
-    assert isinstance(options, FinetunerOptions) and options.cpu_fraction == 0.25 and options.inputs() == ("mapper",)
-    assert options.niceness == (18 if "finetuner.niceness=18" in given else 19)
-    mapper = launch.options["mapper"]
-    assert isinstance(mapper, MapperOptions) and mapper.inputs() == ("camera", "finetuner")
-    assert options.out == mapper.out == str(tmp_path) and options.weights == mapper.weights
-    assert all(node.restart == "on-failure" for node in launch.nodes if node.kind != "camera")
-    assert {"labels", "query", "finetuner"} <= set(launch.sockets()) and launch.listeners("camera") == 1
-    other = path.read_text(encoding="utf-8").replace('learner = "finetuner"', 'learner = "finetunes"')
-    (tmp_path / "other.toml").write_text(other, encoding="utf-8")
-    with pytest.raises(ConfigError, match="did you mean `finetuner`"):
-        load_launch(tmp_path / "other.toml", given, tmp_path)

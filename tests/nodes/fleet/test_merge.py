@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -29,7 +28,7 @@ from tests.mapping.rendered_views import small_map
 from tests.mapping.test_merge import fuse_views, turned
 from tests.mapping.test_voxel_map import same
 from tests.nodes.fleet.made_up import made_up, store_of
-from tests.nodes.support import run_here
+from tests.nodes.support import run_ok
 
 DEMO = Path(semantic_mapper.__file__).parent / "demo.mcap"
 POSES = {"a": np.eye(4), "b": turned((0, 0, 30), (0.31, -1.27, 0.553)), "c": turned((0, 0, 0), (0.26, -0.06, 0.80))}
@@ -84,27 +83,6 @@ def test_the_latest_replays_of_a_store_are_merged(maps: list[str], tmp_path: Pat
     assert same(merged([store.url]).merged.block_state(), merged(maps).merged.block_state())
 
 
-def test_poses_are_found_in_what_was_merged_before(maps: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    tried: list[tuple[int, int]] = []
-
-    def find(whole: VoxelMap, other: VoxelMap, way_out: str) -> SimpleNamespace:
-        tried.append((whole.frames, other.last_stamp_ns))
-        if whole.frames == 4 and other.last_stamp_ns == 1007:  # "b" is next to nothing but "c"
-            raise MapError("too few places")
-        pose = POSES["c" if other.last_stamp_ns == 1011 else "b"]
-        return SimpleNamespace(agreeing=5, looked_for=9, T_map_other=pose)
-
-    monkeypatch.setattr(merge, "find_alignment", find)
-    report = merged(maps, {})
-    assert tried == [(4, 1007), (4, 1011), (8, 1007)]
-    assert list(report.poses) == ["a", "c", "b"]
-    assert report.notes == (
-        "a: the world is its own",
-        "c: 5 of 9 places found in the maps before it",
-        "b: 5 of 9 places found in the maps before it",
-    )
-
-
 def test_maps_find_where_they_lie_by_what_they_show(tmp_path: Path) -> None:
     T_map_world = yaw_transform(np.array((2.0, -1.0, 0.3)), 40.0)
     with open_log(DEMO) as log:
@@ -112,7 +90,6 @@ def test_maps_find_where_they_lie_by_what_they_show(tmp_path: Path) -> None:
     for number, pose in enumerate((np.eye(4), T_map_world)):
         voxel_map = VoxelMap(VoxelMapConfig(voxel_size_m=0.04), ROOMS)
         for frame in frames[number::2]:
-            assert frame.depth_m is not None
             moved = replace(frame, T_world_camera=pose @ frame.T_world_camera)
             voxel_map.integrate(moved, frame.depth_m, None)
             if voxel_map.places.wants(moved.T_world_camera):
@@ -127,45 +104,35 @@ def test_maps_find_where_they_lie_by_what_they_show(tmp_path: Path) -> None:
 
 def test_maps_that_cannot_be_merged_are_refused(maps: list[str], tmp_path: Path) -> None:
     shutil.copy(Path(maps[0], "map.npz"), tmp_path / "twin.npz")
-    with pytest.raises(MapError, match="a and twin are the same map"):
-        merged([*maps, str(tmp_path / "twin.npz")])
-    with pytest.raises(MapError, match=r"cannot be added; .*: b: .*nothing to find"):
-        merged(maps, {"a": np.eye(4), "c": POSES["c"]})
-    with pytest.raises(ConfigError, match="two maps or more"):
-        merged(maps[:1])
-    with pytest.raises(ConfigError, match="--poses names d, but the maps are a, b, c"):
-        merged(maps, {"d": np.eye(4)})
-    with pytest.raises(ConfigError, match="no such map file"):
-        merged([*maps, str(tmp_path / "none.npz")])
-    with pytest.raises(ConfigError, match="two maps or more; these are: none"):
-        merged([store_of(tmp_path / "store").url])
     place = Place("camera", 5, np.eye(4), np.ones((5, 3), np.float32), np.ones((5, 128), np.uint8))
     for name, folder in zip("ab", maps, strict=False):
         voxel_map = VoxelMap.load(Path(folder, "map.npz"))
         voxel_map.places.add(place)
         voxel_map.save(tmp_path / f"{name}.npz")
-    with pytest.raises(MapError, match="b: both maps were made with the same frames"):
-        merged([str(tmp_path / "a.npz"), str(tmp_path / "b.npz")], {name: POSES[name] for name in "ab"})
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [('{"a": [1, 2, 3]}', r"a: expected 4 rows of 4 numbers or \[x, y, z, yaw_deg\]"), ('{"a": ', "not valid JSON")],
-)
-def test_poses_that_are_none_are_refused(tmp_path: Path, text: str, says: str) -> None:
+    for error, said, given, poses in (
+        (MapError, "a and twin are the same map", [*maps, str(tmp_path / "twin.npz")], POSES),
+        (MapError, r"cannot be added; .*: b: .*nothing to find", maps, {"a": np.eye(4), "c": POSES["c"]}),
+        (MapError, "b: both maps were made with the same frames", [f"{tmp_path}/a.npz", f"{tmp_path}/b.npz"], {}),
+        (ConfigError, "--poses names d, but the maps are a, b, c", maps, {"d": np.eye(4)}),
+        (ConfigError, "no such map file", [*maps, str(tmp_path / "none.npz")], POSES),
+        (ConfigError, "two maps or more; these are: none", [store_of(tmp_path / "store").url], POSES),
+    ):
+        with pytest.raises(error, match=said):
+            merged(given, poses or {name: POSES[name] for name in "ab"})
     path = tmp_path / "poses"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=says):
-        read_poses(path)
-    path.write_text('{"a": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}')
-    with pytest.raises(PoseError):
-        read_poses(path)
+    for error, said, text in (
+        (ConfigError, r"a: expected 4 rows of 4 numbers or \[x, y, z, yaw_deg\]", '{"a": [1, 2, 3]}'),
+        (ConfigError, "not valid JSON", '{"a": '),
+        (PoseError, "", '{"a": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}'),
+    ):
+        path.write_text(text)
+        with pytest.raises(error, match=said):
+            read_poses(path)
 
 
 def test_the_command_merges_and_query_reads(maps: list[str], tmp_path: Path) -> None:
     poses, out = tmp_path / "poses.json", tmp_path / "house.npz"
     poses.write_text(json.dumps({"a": [0, 0, 0, 0], "b": POSES["b"].tolist(), "c": [0.26, -0.06, 0.8, 0]}))
-    code, said = run_here("fleet", "merge", *maps, "--out", out, "--poses", poses)
-    assert code == 0 and "b: pose as given" in said and "3 maps, 12 frames" in said
-    code, said = run_here("query", out, "info")
-    assert code == 0 and "12" in said
+    said = run_ok("fleet", "merge", *maps, "--out", out, "--poses", poses).stdout
+    assert "b: pose as given" in said and "3 maps, 12 frames" in said
+    assert "12" in run_ok("query", out, "info").stdout

@@ -68,22 +68,16 @@ def test_other_settings_weights_content_or_code_are_another_result(tmp_path: Pat
 @pytest.mark.parametrize(
     ("operation", "sets", "file", "metric"),
     [
-        ("eval", ("max_frames=2",), "eval.html", ("frames_scored", 2)),
-        ("autolabel", ("max_frames=2",), "labelled.mcap", ("frames", 2)),
-        ("finetune", ("keyframes=2", "steps=1", "seconds=0", "width=96"), "weights.safetensors", ("steps", 1)),
+        ("eval", "max_frames=2", "eval.html", ("frames_scored", 2)),
+        ("autolabel", "max_frames=2", "labelled.mcap", ("frames", 2)),
+        ("finetune", "keyframes=2 steps=1 seconds=0 width=96", "weights.safetensors", ("steps", 1)),
     ],
 )
 def test_operations_leave_their_files_and_figures(
-    tmp_path: Path,
-    log: Path,
-    weights: Path,
-    config: Path,
-    operation: str,
-    sets: tuple[str, ...],
-    file: str,
-    metric: tuple[str, float],
+    tmp_path: Path, log: Path, weights: Path, config: Path, operation: str, sets: str, file: str, metric: Any
 ) -> None:
-    found = done(task_of(operation, tmp_path, weights, None if operation == "finetune" else config, *sets), log)
+    settings = None if operation == "finetune" else config
+    found = done(task_of(operation, tmp_path, weights, settings, *sets.split()), log)
     assert file in found.files and found.findings.metrics[metric[0]] == metric[1]
     if operation == "eval":
         assert found.findings.scores[0].method == "sray"
@@ -108,20 +102,15 @@ def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Pa
     assert not list(Store(task.store).results())
 
 
-@pytest.mark.parametrize(
-    ("operation", "weights", "sets", "why"),
-    [
+def test_no_store_is_made_for_what_cannot_be_run(tmp_path: Path) -> None:
+    for operation, weights, sets, why in (
         ("replay", None, "max_frame=3", "did you mean `max_frames`"),
         ("finetune", None, "second=3", "did you mean `seconds`"),
         ("replay", None, "voxel_map.voxel_size=3", "voxel_size_m"),
         ("replay", "none.safetensors", "max_frames=3", r"none\.safetensors: is missing"),
-    ],
-)
-def test_no_store_is_made_for_what_cannot_be_run(
-    tmp_path: Path, operation: str, weights: str | None, sets: str, why: str
-) -> None:
-    with pytest.raises((ConfigError, StoreError), match=why):
-        run.make_task(operation, str(tmp_path / "store"), weights, [sets])
+    ):
+        with pytest.raises((ConfigError, StoreError), match=why):
+            run.make_task(operation, str(tmp_path / "store"), weights, [sets])
     assert not (tmp_path / "store").exists()
 
 
@@ -161,26 +150,18 @@ def test_every_log_is_done_once_and_the_rest_goes_on_without_those_that_fail(tmp
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_cluster")
-def test_the_same_command_tries_failed_logs_again_and_forgets_what_went_wrong(tmp_path: Path) -> None:
-    assert len(run_logs(tmp_path, "bad-once").failures) == 1
+def test_a_stop_ends_tasks_at_once_and_the_same_command_tries_failed_logs_again(tmp_path: Path) -> None:
+    report = run_logs(tmp_path, "sleeps1", "sleeps2", "sleeps3", stopped=lambda: len(traces(tmp_path)) == 2)
+    assert report.over == 0
+    assert len(run_logs(tmp_path, "bad-once").failures) == 1, "the processors are free again"
     assert run_logs(tmp_path, "bad-once").done == 1
     assert not list(Store(str(tmp_path / "store")).failures())
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_cluster")
-def test_a_stop_ends_tasks_at_once(tmp_path: Path) -> None:
-    report = run_logs(tmp_path, "sleeps1", "sleeps2", "sleeps3", stopped=lambda: len(traces(tmp_path)) == 2)
-    assert report.over == 0
-    assert run_logs(tmp_path, "log").done == 1, "the processors are free again"
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_cluster")
-@pytest.mark.parametrize(
-    ("needs", "what"), [({"cpus": 64}, "64 CPUs"), ({"gpus": 1}, "1 GPUs"), ({"memory_gb": 1e6}, "1e.06 GB of memory")]
-)
-def test_what_no_node_has_is_refused_at_once(tmp_path: Path, needs: dict[str, Any], what: str) -> None:
+def test_what_no_node_has_is_refused_at_once(tmp_path: Path) -> None:
     task = Task("replay", Store(str(tmp_path), create=True).url, {}, {}, "", b"", "")
-    with pytest.raises(FleetError, match=what):
-        run_fleet(task, [LogInput("a")], function=do_as_named, **needs)
+    for needs, what in (({"cpus": 64}, "64 CPUs"), ({"gpus": 1}, "1 GPUs"), ({"memory_gb": 1e6}, "1e.06 GB")):
+        with pytest.raises(FleetError, match=what):
+            run_fleet(task, [LogInput("a")], function=do_as_named, **needs)

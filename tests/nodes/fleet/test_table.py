@@ -27,25 +27,11 @@ def test_a_log_is_a_row_with_its_metrics_costs_and_tags(tmp_path: Path) -> None:
     assert tables.query("FROM failures").values[0][:2] == ("replay", result.log)
     assert tables.query("SELECT kind, text FROM events").values == [("refused", "frame 7: pose jumps")] * 2
     assert tables.columns()["logs"][:3] == ("key", "operation", "log")
-
-
-def test_columns_alone_are_columns_of_logs(tmp_path: Path) -> None:
-    found = Tables(store_of(tmp_path, [made_up(n) for n in range(3)])).query("log, round(miou, 1) AS miou")
-    assert found.names == ("log", "miou") and len(found.values) == 3
-
-
-def test_an_overview_has_a_row_for_each_way_of_running(tmp_path: Path) -> None:
-    assert Tables(store_of(tmp_path / "empty")).overview().values == []
-    results = [*(made_up(n) for n in range(3)), made_up(0, settings={"seed": 1})]
-    overview = Tables(store_of(tmp_path / "store", results)).overview()
-    counts = sorted(row[overview.names.index("logs")] for row in overview.values)
-    assert counts == [1, 3]
-
-
-def test_values_are_those_of_json(tmp_path: Path) -> None:
+    found = tables.query("log, round(miou, 1) AS miou")  # columns alone are those of logs
+    assert found.names == ("log", "miou") and len(found.values) == 2
     sql = "SELECT 'nan'::DOUBLE, 1.5::DECIMAL(4, 1), DATE '2026-01-02', [1, 2], sum(1), true"
-    (row,) = Tables(store_of(tmp_path)).query(sql).values
-    assert json.loads(json.dumps(row, allow_nan=False)) == [None, 1.5, "2026-01-02", "[1, 2]", 1, True]
+    (values,) = tables.query(sql).values
+    assert json.loads(json.dumps(values, allow_nan=False)) == [None, 1.5, "2026-01-02", "[1, 2]", 1, True]
 
 
 @pytest.mark.parametrize(

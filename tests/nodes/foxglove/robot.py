@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
+from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FoxgloveOptions
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 from tests.nodes.mapper.test_query_service import a_folder, answering
+from tests.nodes.support import NodeHere, node_here
 from tests.queries.scene import LABELS, whole_map
 from tests.small import tiny_frames
 
@@ -52,10 +49,8 @@ class Robot:
 
     camera: Publisher
     mapper: Publisher
-    bridge: threading.Thread
-    stop: StopRequest
+    bridge: NodeHere
     endpoints: dict[str, str]
-    failures: list[BaseException]
     world: int = 0  # of the camera's frames
     T_map_world: Float64 | None = field(default_factory=lambda: np.eye(4))  # None: its frames are held
 
@@ -83,30 +78,15 @@ class Robot:
 
 
 @contextmanager
-def bridged_robot(run: Callable[[NodeContext, Any], None], options: FoxgloveOptions, name: str) -> Iterator[Robot]:
+def bridged_robot(options: FoxgloveOptions) -> Iterator[Robot]:
     """A robot whose bridge is at work, in a thread of its own."""
-    with a_folder() as folder, ExitStack() as stack:
-        endpoints = {one: f"ipc://{folder / one}" for one in ("camera", "mapper", "query", name)}
-        camera, mapper = (stack.enter_context(Publisher(endpoints[one])) for one in ("camera", "mapper"))
-        stop = StopRequest(patient=True)
-        context = NodeContext(name, endpoints, 0, stop, HeartbeatWriter(-1, 1))
-        failures: list[BaseException] = []
-
-        def work() -> None:
-            try:
-                run(context, options)
-            except BaseException as error:
-                failures.append(error)
-                raise
-
-        bridge = threading.Thread(target=work, daemon=True)
-        bridge.start()
-        for publisher, topic in ((camera, "frame"), (mapper, "map"), (mapper, "status")):
-            publisher.wait_for_subscribers(topic, timeout_s=WARM_S)
-        try:
-            yield Robot(camera, mapper, bridge, stop, endpoints, failures)
-        finally:
-            stop.signum = 15
-            bridge.join(60)
-            assert not bridge.is_alive()
-        assert not failures
+    with a_folder() as folder:
+        endpoints = {one: f"ipc://{folder / one}" for one in ("camera", "mapper", "query", "foxglove")}
+        with (
+            Publisher(endpoints["camera"]) as camera,
+            Publisher(endpoints["mapper"]) as mapper,
+            node_here(run_foxglove, "foxglove", endpoints, options) as bridge,
+        ):
+            for publisher, topic in ((camera, "frame"), (mapper, "map"), (mapper, "status")):
+                publisher.wait_for_subscribers(topic, timeout_s=WARM_S)
+            yield Robot(camera, mapper, bridge, endpoints)

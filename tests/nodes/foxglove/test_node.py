@@ -21,7 +21,6 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.foxglove.server import BACKLOG, FoxgloveServer
 from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.plots import class_colors
@@ -44,7 +43,7 @@ def port() -> int:
 
 @pytest.fixture
 def robot(port: int) -> Iterator[Robot]:
-    with bridged_robot(run_foxglove, FoxgloveOptions(port=port, refresh_s=REFRESH_S), "foxglove") as robot:
+    with bridged_robot(FoxgloveOptions(port=port, refresh_s=REFRESH_S)) as robot:
         yield robot
 
 
@@ -61,6 +60,12 @@ def gather(client: FoxgloveClient, robot: Robot | None, wanted: set[str]) -> dic
 
     assert eventually(step, WARM_S), f"no {wanted - set(found)}"
     return found
+
+
+def read_picture(received: Received, flags: int = cv2.IMREAD_COLOR_RGB) -> np.ndarray:
+    picture = CompressedImage.FromString(received.data)
+    assert picture.timestamp.ToNanoseconds() == received.log_time_ns
+    return cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
 
 
 def read_cloud(received: Received) -> np.ndarray:
@@ -85,15 +90,9 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, port: int) -> No
         assert service.alive
     assert all(message.log_time_ns == frame.stamp_ns for message in found.values())
 
-    picture = CompressedImage.FromString(found[f"{camera}/rgb"].data)
-    assert picture.format == "jpeg" and picture.timestamp.ToNanoseconds() == frame.stamp_ns
-    shown = cv2.cvtColor(cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    assert np.abs(shown.astype(int) - frame.rgb).mean() < 8
-    picture = CompressedImage.FromString(found[f"{camera}/semantics"].data)
-    shown = cv2.cvtColor(cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    assert (shown == LABELS.colors[1]).all()
-    picture = CompressedImage.FromString(found[f"{camera}/moving"].data)
-    mask = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert np.abs(read_picture(found[f"{camera}/rgb"]).astype(int) - frame.rgb).mean() < 8
+    assert (read_picture(found[f"{camera}/semantics"]) == LABELS.colors[1]).all()
+    mask = read_picture(found[f"{camera}/moving"], cv2.IMREAD_UNCHANGED)
     assert (mask[:2] == 255).all() and not mask[2:].any()
     depth = RawImage.FromString(found[f"{camera}/depth"].data)
     assert depth.encoding == "32FC1" and depth.frame_id == f"camera{camera}"
@@ -116,26 +115,17 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, port: int) -> No
         np.testing.assert_array_equal(np.stack([cloud[c] for c in ("red", "green", "blue")], 1), rgb)
         np.testing.assert_array_equal(cloud["label"], expected.label)
     info = json.loads(found["/map/info"].data)
-    assert (
-        info["points"] == len(expected.xyz)
-        and {"id": 9, "name": "cup", "color": list(LABELS.colors[2])} in info["classes"]
-    )
+    assert info["points"] == len(expected.xyz)
+    assert {"id": 9, "name": "cup", "color": list(LABELS.colors[2])} in info["classes"]
 
     drawn = SceneUpdate.FromString(found["/graph"].data)
-    things = GraphTracker().update(whole()).things
-    boxes = {entity.id: entity for entity in drawn.entities if entity.cubes}
-    assert set(boxes) == {f"thing/{thing.id}" for thing in things} and drawn.deletions
-    cup = next(thing for thing in things if thing.class_name == "cup")
-    box = boxes[f"thing/{cup.id}"].cubes[0]
-    np.testing.assert_allclose([box.size.x, box.size.y, box.size.z], cup.box.size)
-    assert boxes[f"thing/{cup.id}"].texts[0].text == f"cup {cup.id}"
+    boxes = {entity.id for entity in drawn.entities if entity.cubes}
+    assert boxes == {f"thing/{thing.id}" for thing in GraphTracker().update(whole()).things} and drawn.deletions
     status = json.loads(found["/status"].data)
     assert status["node"] == "mapper" and status["counters"]["moving"] == 7
 
 
-def test_a_camera_of_another_world_is_shown_where_the_map_has_it_and_nowhere_while_that_is_not_known(
-    robot: Robot, port: int
-) -> None:
+def test_a_camera_of_another_world_is_shown_once_its_place_in_the_map_is_known(robot: Robot, port: int) -> None:
     robot.world, robot.T_map_world = 7, None
     topics = {"/tf", f"/{tiny_frames()[2].camera_id}/rgb"}
     with FoxgloveClient(f"ws://127.0.0.1:{port}", topics) as client:
@@ -164,7 +154,9 @@ def test_a_late_client_receives_the_map_that_does_not_change_and_so_after_a_rest
                 assert len(read_cloud(gather(client, None, topics)["/map/classes"]))
                 assert all(client.receive(REFRESH_S) is None for _ in range(4)), "the same map is not sent again"
     with FoxgloveClient(url, topics) as client:
-        assert all(client.receive(REFRESH_S) is None for _ in range(4)) and not robot.failures, "the mapper is away"
+        assert all(client.receive(REFRESH_S) is None for _ in range(4)) and robot.bridge.error is None, (
+            "the mapper is away"
+        )
         with robot.mapped():
             gather(client, None, topics)
 
@@ -174,23 +166,20 @@ def test_a_mapper_with_keys_answers_who_has_the_same(port: int, tmp_path: Path) 
     allow(robot_keys.folder, "desk", desk.public.decode())
     options = FoxgloveOptions(port=port, refresh_s=REFRESH_S, keys=str(robot_keys.folder))
     with (
-        bridged_robot(run_foxglove, options, "foxglove") as robot,
+        bridged_robot(options) as robot,
         robot.mapped(robot_keys),
         FoxgloveClient(f"ws://127.0.0.1:{port}", {"/map/info"}) as client,
     ):
         found = gather(client, None, {"/map/info"})
     info = json.loads(found["/map/info"].data)
-    assert info["points"] == len(surface_points(whole(), surface_voxels(whole())).xyz), (
-        "the map came through the sockets with keys"
-    )
+    assert info["points"] == len(surface_points(whole(), surface_voxels(whole())).xyz)
 
 
 def test_it_ends_with_the_stream_and_lets_the_camera_go(port: int) -> None:
-    with bridged_robot(run_foxglove, FoxgloveOptions(port=port, refresh_s=REFRESH_S), "foxglove") as robot:
+    with bridged_robot(FoxgloveOptions(port=port, refresh_s=REFRESH_S)) as robot:
         robot.end()
         assert eventually(lambda: not robot.camera.subscribers("frame"), 20)
-        robot.bridge.join(20)
-        assert not robot.bridge.is_alive()
+        robot.bridge.wait(20)
 
 
 def test_a_client_that_does_not_keep_up_loses_the_oldest(port: int) -> None:

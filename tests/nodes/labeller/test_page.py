@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -88,10 +87,6 @@ def test_strokes_of_the_mouse_are_saved_at_once_and_can_be_undone_and_erased(pag
     page.browser.press("2")
     page.browser.drag(page.on((10, 50), (30, 50), (80, 50)))
     assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
-    label = cv2.imread(str(page.out / "000004.png"), cv2.IMREAD_UNCHANGED)
-    assert set(np.unique(label)) == {ROOMS.ignore_id, FLOOR} and label.shape == (HEIGHT, WIDTH)
-    assert (label[:40] == ROOMS.ignore_id).all() and not (label[50, :5] == FLOOR).any()
-
     page.browser.press("1")
     page.browser.drag(page.on((10, 10), (80, 12)))
     assert page.saved(4, lambda label: bool(label[10, 10] == WALL and label[12, 80] == WALL and label[50, 40] == FLOOR))
@@ -113,16 +108,9 @@ def test_what_was_saved_is_there_again_and_a_click_is_a_dot(page: Page) -> None:
     assert page.status("nothing painted yet") and page.shown(48, 30)[3] == 0
     page.browser.drag(page.on((5, 5), (90, 5)))
     assert page.saved(1, lambda label: bool((label[5, 5:91] == CEILING).all()))
-    page.browser.press("p")
-    assert page.eventually(lambda: page.shown(48, 30) == [*ROOMS.colors[CEILING - 1], 255])
     page.open()
     assert page.eventually(lambda: "2 labelled" in page.browser.evaluate("place.textContent"))
     assert page.eventually(lambda: page.shown(48, 30) == [*ROOMS.colors[CEILING - 1], 255])
-    labels = json.loads((page.out / "labels.json").read_text())
-    assert labels["log"]["name"] == "room.mcap" and sorted(f.name for f in page.out.glob("*.png")) == [
-        "000001.png",
-        "000004.png",
-    ]
 
 
 def test_all_of_it_can_be_done_with_keys_alone(page: Page) -> None:
@@ -134,12 +122,6 @@ def test_all_of_it_can_be_done_with_keys_alone(page: Page) -> None:
     page.browser.press("PageDown")
     assert page.status("nothing painted yet")
     assert page.browser.evaluate("document.getElementById('number').value") == "1"
-    page.browser.evaluate("document.querySelector('[role=radio][aria-checked=true]').focus()")
-    page.browser.press("ArrowDown")
-    assert page.browser.evaluate("document.activeElement.textContent").startswith("ceiling")
-    assert page.browser.evaluate("document.activeElement.getAttribute('aria-checked')") == "true"
-    page.browser.press("-", "-")
-    assert page.browser.evaluate("document.getElementById('paint').style.opacity") == "0.4"
     unnamed = "[...document.querySelectorAll('button, input')].filter(e => !(e.textContent || e.labels?.length)).length"
     assert page.browser.evaluate(unnamed) == 0, "each control has a name"
 
@@ -157,26 +139,3 @@ def test_a_stroke_that_cannot_be_saved_is_said_kept_and_saved_later(page: Page) 
     moved.rename(page.out)
     assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
     assert (page.out / "labels.json").read_bytes() == labels
-
-
-def test_the_page_shows_what_strokes_grow_to(page: Page) -> None:
-    def grown(x: int, y: int) -> int:
-        script = f"document.getElementById('grown').getContext('2d').getImageData({x}, {y}, 1, 1).data[3]"
-        return page.browser.evaluate(script)
-
-    def covered() -> int:
-        script = (
-            "(c => [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]"
-            ".filter((v, i) => i % 4 === 3 && v).length)(document.getElementById('grown'))"
-        )
-        return page.browser.evaluate(script)
-
-    page.browser.press("2")
-    page.browser.drag(page.on((10, 50), (30, 50), (80, 50)))
-    assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
-    painted = int((cv2.imread(str(page.out / "000004.png"), cv2.IMREAD_UNCHANGED) == FLOOR).sum())
-    assert page.eventually(lambda: covered() > painted) and grown(40, 50) == 255
-    page.browser.press("s")
-    assert page.browser.evaluate("document.getElementById('grown').hidden") is True
-    page.browser.press("s", "n")
-    assert page.status("nothing painted yet") and page.eventually(lambda: covered() == 0)

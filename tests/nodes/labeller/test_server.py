@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -18,6 +19,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.replay.label_folder import make_label_folder
 from semantic_mapper.replay.log.sequence import open_log
+from tests.nodes.support import addresses_listening
 
 HEIGHT, WIDTH = 72, 96
 WALL, FLOOR = ROOMS.id_of("wall"), ROOMS.id_of("floor")
@@ -44,19 +46,16 @@ class Page(NamedTuple):
     def ask(self, path: str, method: str = "GET", body: bytes | None = None, **headers: str) -> Answer:
         """What is behind the token; a path that begins with / stands for itself."""
         place = urlsplit(self.url)
-        connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=20)
-        try:
+        with closing(http.client.HTTPConnection(str(place.hostname), place.port, timeout=20)) as connection:
             whole = path if path.startswith("/") else place.path + path
             connection.putrequest(method, whole, skip_host="Host" in headers, skip_accept_encoding=True)
-            if body is not None and "Content_Length" not in headers:
-                headers["Content_Length"] = str(len(body))
+            if body is not None:
+                headers = {"Content_Length": str(len(body)), **headers}
             for name, value in headers.items():
                 connection.putheader(name.replace("_", "-"), value)
             connection.endheaders(body)
             came = connection.getresponse()
             return Answer(came.status, came.read(), dict(came.headers))
-        finally:
-            connection.close()
 
 
 @pytest.fixture
@@ -66,13 +65,6 @@ def page(log: Path, tmp_path: Path) -> Iterator[Page]:
         folder = make_label_folder(out, opened, ROOMS)
         with LabelServer(LabelSession(opened, folder, [4, 1]), 0) as server:
             yield Page(server.url, out)
-
-
-def listening(port: int | None) -> str:
-    """Addresses on which somebody listens to a port, as the kernel writes them."""
-    lines = Path("/proc/net/tcp").read_text().splitlines()[1:] + Path("/proc/net/tcp6").read_text().splitlines()[1:]
-    places = (line.split()[1].split(":") for line in lines if line.split()[3] == "0A")
-    return " ".join(sorted(address for address, number in places if int(number, 16) == port))
 
 
 def strokes() -> np.ndarray[Any, Any]:
@@ -97,24 +89,21 @@ def test_the_page_and_its_parts_are_there_for_who_has_the_token(page: Page) -> N
     assert b"http" not in page.ask("").body + page.ask("page.css").body, "it fetches nothing from elsewhere"
 
 
-@pytest.mark.parametrize("path", ["/", "/session", "/x/session", "/{cut}/session"])
-def test_nothing_is_there_without_the_token(page: Page, path: str) -> None:
-    path = path.format(cut=page.token[:-1], more=page.token + "a")
-    for method, body in (("GET", None), ("PUT", strokes().tobytes())):
-        answer = page.ask(path, method, body)
-        assert answer.status == 403 and page.token.encode() not in answer.body
+def test_nothing_is_there_without_the_token_nor_on_another_address(page: Page, log: Path, tmp_path: Path) -> None:
+    for path in ("/", "/session", "/x/session", f"/{page.token[:-1]}/session"):
+        for method, body in (("GET", None), ("PUT", strokes().tobytes())):
+            answer = page.ask(path, method, body)
+            assert answer.status == 403 and page.token.encode() not in answer.body
     assert not list(page.out.glob("*.png"))
-
-
-def test_two_pages_have_two_tokens(log: Path, tmp_path: Path) -> None:
+    port = urlsplit(page.url).port or 0
+    assert addresses_listening(port) == {"0100007F"}, "on loopback alone"
     with open_log(log) as opened:
-        session = LabelSession(opened, make_label_folder(tmp_path / "labels", opened, ROOMS), [0])
-        with LabelServer(session, 0) as one, LabelServer(session, 0) as other:
-            assert {listening(urlsplit(s.url).port) for s in (one, other)} == {"0100007F"}, "on loopback alone"
-            tokens = [urlsplit(s.url).path.strip("/") for s in (one, other)]
-            assert tokens[0] != tokens[1] and min(map(len, tokens)) >= 32
+        session = LabelSession(opened, make_label_folder(tmp_path / "more", opened, ROOMS), [0])
+        with LabelServer(session, 0) as other:
+            token = urlsplit(other.url).path.strip("/")
+            assert page.token != token and min(len(page.token), len(token)) >= 32
             with pytest.raises(TransportError, match="give another one with --port"):
-                LabelServer(session, int(urlsplit(one.url).port or 0))
+                LabelServer(session, port)
 
 
 def test_names_that_lead_here_from_elsewhere_are_refused(page: Page) -> None:
@@ -136,7 +125,7 @@ def test_the_session_says_what_to_paint_on_the_images_of_the_log(page: Page, log
     assert session["classes"][0] == {"id": WALL, "name": "wall", "color": list(ROOMS.colors[0])}
     answer = page.ask("frames/4/image")
     assert answer.headers["Content-Type"] == "image/jpeg"
-    seen = cv2.cvtColor(cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    seen = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR_RGB)
     with open_log(log) as opened:
         assert np.abs(seen.astype(int) - opened.frame(4).rgb).mean() < 4
 
@@ -156,23 +145,18 @@ def test_what_is_painted_is_a_label_image_and_comes_back(page: Page, log: Path) 
     assert not (page.out / "000001.png").exists(), "all of it is erased"
 
 
-@pytest.mark.parametrize(
-    ("frame", "body", "status", "says"),
-    [
+def test_bad_labels_are_refused_and_nothing_is_written(page: Page) -> None:
+    (page.out / "000004.png").write_bytes(b"no image")
+    before, good = sorted(p.name for p in page.out.parent.rglob("*")), strokes().tobytes()
+    for frame, body, status, says in (
         ("1", strokes()[:-1].tobytes(), 400, "has 6912 pixels"),
         ("1", bytes([200]) * (HEIGHT * WIDTH), 400, "class ids [200] are not in label set"),
-        ("6", strokes().tobytes(), 400, "has no frame 6; it has 6"),
-        ("-1", strokes().tobytes(), 404, "no such page"),
-        ("..%2f1", strokes().tobytes(), 404, "no such page"),
-    ],
-)
-def test_bad_labels_are_refused_and_nothing_is_written(
-    page: Page, frame: str, body: bytes, status: int, says: str
-) -> None:
-    (page.out / "000004.png").write_bytes(b"no image")
-    before = sorted(p.name for p in page.out.parent.rglob("*"))
-    answer = page.ask(f"frames/{frame}/label", "PUT", body)
-    assert (answer.status, says in answer.says) == (status, True), answer.body
+        ("6", good, 400, "has no frame 6; it has 6"),
+        ("-1", good, 404, "no such page"),
+        ("..%2f1", good, 404, "no such page"),
+    ):
+        answer = page.ask(f"frames/{frame}/label", "PUT", body)
+        assert (answer.status, says in answer.says) == (status, True), answer.body
     for length in ("", "-1", "999999999999"):  # refused before anything is read
         assert page.ask("frames/1/label", "PUT", b"x", Content_Length=length).status in (400, 411)
     for path in ("../labels.json", "..%2flabels.json", "x"):

@@ -24,19 +24,22 @@ from semantic_mapper.types import CameraIntrinsics
 from tests.nodes.support import write_log
 from tests.small import tiny_frames
 
-SMALL = """
+EYE = """
 [[node]]
 name = "eye"
 kind = "camera"
 [node.options]
 log = ""
 mode = "realtime"
+"""
+SMALL = f"""
+{EYE}
 [[node]]
 name = "brain"
 kind = "mapper"
 [node.options]
 input = "eye"
-out = "{out}/map"
+out = "{{out}}/map"
 """
 
 
@@ -46,22 +49,26 @@ def file_of(folder: Path, text: str) -> Path:
     return path
 
 
+def shipped(name: str, *settings: str) -> Any:
+    """A launch file of the package."""
+    return load_launch(find_launch(Path(name)), settings, Path("there"))
+
+
 def options_of(name: str, *settings: str) -> dict[str, dict[str, Any]]:
-    """Options of the nodes of a launch file of the package, as plain data."""
-    launch = load_launch(find_launch(Path(name)), settings, Path("there"))
-    return {node: msgspec.to_builtins(options) for node, options in launch.options.items()}
+    """Options of its nodes, as plain data."""
+    return {node: msgspec.to_builtins(options) for node, options in shipped(name, *settings).options.items()}
 
 
 def test_a_log_goes_through_in_lockstep_and_in_a_live_launch_in_its_own_time() -> None:
     nodes = options_of("replay", "camera.log=room.mcap")
     assert nodes.keys() == {"mapper", "camera"} and nodes["mapper"]["out"] == "there"
     assert (nodes["camera"]["mode"], nodes["mapper"]["delivery"]) == ("lockstep", "all")
-    launch = load_launch(find_launch(Path("replay.toml")), ["camera.log=room.mcap", "recorder.enabled=true"])
+    launch = shipped("replay.toml", "camera.log=room.mcap", "recorder.enabled=true")
     assert {node.restart for node in launch.nodes} == {"never"} and launch.listeners("camera") == 2
     for name in ("camera", "learning"):
         nodes = options_of(name, "camera.log=room.mcap")
         assert (nodes["camera"]["camera"], nodes["camera"]["mode"]) == (None, "realtime")
-    launch = load_launch(find_launch(Path("camera")), ["camera.log=room.mcap", "mapper.restart=never"])
+    launch = shipped("camera", "camera.log=room.mcap", "mapper.restart=never")
     assert {node.name: node.restart for node in launch.nodes} == {"mapper": "never", "camera": "on-failure"}
 
 
@@ -75,9 +82,7 @@ def test_a_log_goes_through_in_lockstep_and_in_a_live_launch_in_its_own_time() -
         ("opencv", ["source=film.mp4", "pace=fast"], {"source": "film.mp4", "pace": "fast"}, "visual"),
     ],
 )
-def test_settings_of_a_camera_fit_its_driver_and_poses(
-    kind: str, settings: list[str], config: dict[str, object], poses: str
-) -> None:
+def test_settings_fit_driver_and_poses(kind: str, settings: list[str], config: dict[str, object], poses: str) -> None:
     given = [f"camera.config.{text}" for text in settings]
     if poses in ("topic", "visual"):  # the others are those that this kind of camera has without being given any
         given += [f"camera.poses.kind={poses}"]
@@ -102,11 +107,24 @@ def test_values_are_read_as_their_setting_wants_them(tmp_path: Path) -> None:
         assert load_launch(file_of(tmp_path, SMALL), [f"eye.log={text}"]).options["eye"].log == text  # type: ignore[union-attr]
 
 
-def test_keys_of_the_launch_are_those_of_its_nodes() -> None:
+def test_finetuner_foxglove_and_keys_fit_the_nodes_of_their_launch() -> None:
+    launch = shipped("learning", "camera.log=x", "finetuner.cpu_fraction=0.25")
+    mapper, finetuner = launch.options["mapper"], launch.options["finetuner"]
+    assert finetuner.cpu_fraction == 0.25 and finetuner.niceness == 19
+    assert (finetuner.inputs(), mapper.inputs()) == (("mapper",), ("camera", "finetuner"))
+    assert finetuner.out == mapper.out == "there" and finetuner.weights == mapper.weights
+    assert {"labels", "query", "finetuner"} <= set(launch.sockets()) and launch.listeners("camera") == 1
+    given = ["camera.kind=v4l2", "camera.config=webcam.toml", "camera.poses=poses.toml", "foxglove.enabled=true"]
+    launch = shipped("camera", *given, "mapper.query=ask", "mapper.keys=k")
+    foxglove = launch.options["foxglove"]
+    assert (foxglove.inputs(), foxglove.query, foxglove.keys) == (("camera", "mapper"), "ask", "k")
+    assert launch.listeners("camera") == 2
+    with pytest.raises(ConfigError, match="node 'foxglove' shows the map of 'camera', which is no mapper"):
+        shipped("camera", *given, "foxglove.mapper=camera")
     nodes = options_of("onboard", "keys=k", "publish=tcp://127.0.0.1:7")
     assert nodes["mapper"]["keys"] == "k" and nodes["mapper"]["query"].startswith("tcp://127.0.0.1:")
-    launch = load_launch(find_launch(Path("onboard")), ["keys=k", "mapper.keys=own", "publish=tcp://127.0.0.1:7"])
-    assert (launch.file.publish, launch.file.keys, launch.options["mapper"].keys) == ("tcp://127.0.0.1:7", "k", "own")  # type: ignore[union-attr]
+    launch = shipped("onboard", "keys=k", "mapper.keys=own", "publish=tcp://127.0.0.1:7")
+    assert (launch.file.publish, launch.file.keys, launch.options["mapper"].keys) == ("tcp://127.0.0.1:7", "k", "own")
     assert launch.sockets() == ("launch", "mapper", "camera", "recorder")
     assert {node.restart for node in launch.nodes} == {"on-failure"} and launch.file.heartbeat_s == 1.5
 
@@ -118,51 +136,31 @@ def test_several_cameras_fit_drivers_poses_and_calibrations(tmp_path: Path) -> N
     for name in ("left", "right"):
         save_calibration(tmp_path / f"{name}.toml", CameraIntrinsics(500.0, 500.0, 319.5, 239.5, 640, 480), T, {})
         given += [f"{name}.config.device=/dev/{name}", f"{name}.config.calibration={tmp_path}/{name}.toml"]
-    launch = load_launch(find_launch(Path("multi-camera")), given)
+    launch = shipped("multi-camera", *given)
     assert launch.options["mapper"].inputs() == ("left", "right")
     assert launch.listeners("left") == launch.listeners("right") == 2
     for name in ("left", "right"):
-        camera: Any = launch.options[name]
-        assert camera.camera.id == name
-        make_source(camera.camera)  # not open yet; would refuse what does not fit
+        camera = launch.options[name].camera
+        assert camera.id == name
+        make_source(camera)  # not open yet; would refuse what does not fit
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (('id = "right"', 'id = "left"'), "two cameras of node 'mapper', 'left' and 'right', have the id 'left'; give"),
-        (('input = ["left", "right"]', 'input = ["left", "recorder"]'), "'recorder', which is no camera"),
-        (("streams = 2", "streams = 3"), "'mapper', which is no camera"),
-    ],
-)
-def test_mistakes_with_several_cameras_are_named(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+def test_mistakes_with_several_cameras_are_named(tmp_path: Path) -> None:
     text = launch_files()["multi-camera"].read_text(encoding="utf-8")
-    assert change[0] in text
-    with pytest.raises(ConfigError) as caught:
-        load_launch(file_of(tmp_path, text.replace(*change)))
-    assert says in str(caught.value)
-
-
-def test_two_logs_of_one_camera_are_refused_with_the_ways_out(tmp_path: Path) -> None:
-    frames = tiny_frames(2)
-    one, other = write_log(tmp_path / "one.mcap", frames), write_log(tmp_path / "other.mcap", frames)
-    second = SMALL[: SMALL.index('[[node]]\nname = "brain"')].replace("eye", "second")
-    path = file_of(tmp_path, second + SMALL.replace('input = "eye"', 'input = ["eye", "second"]'))
+    for old, new, says in (
+        ('id = "right"', 'id = "left"', "cameras of node 'mapper', 'left' and 'right', have the id 'left'"),
+        ('input = ["left", "right"]', 'input = ["left", "recorder"]', "'recorder', which is no camera"),
+        ("streams = 2", "streams = 3", "'mapper', which is no camera"),
+    ):
+        assert old in text
+        with pytest.raises(ConfigError, match=says):
+            load_launch(file_of(tmp_path, text.replace(old, new)))
+    one, other = (write_log(tmp_path / name, tiny_frames(2)) for name in ("one.mcap", "other.mcap"))
+    path = file_of(tmp_path, EYE.replace("eye", "second") + SMALL.replace('"eye"\nout', '["eye", "second"]\nout'))
     with pytest.raises(ConfigError, match=r"'eye' and 'second', have the id 'rooms'; frames of a log keep.*own"):
         load_launch(path, [f"eye.log={one}", f"second.log={other}"])
     live = [f"eye.log={one}", "second.kind=v4l2", "second.poses.kind=fixed", "second.id=other"]
     assert load_launch(path, live).options["second"].camera.kind == "v4l2"  # type: ignore[union-attr]
-
-
-def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
-    given = ["camera.kind=v4l2", "camera.config=webcam.toml", "camera.poses=poses.toml", "foxglove.enabled=true"]
-    launch = load_launch(find_launch(Path("camera")), given)
-    assert launch.options["foxglove"].inputs() == ("camera", "mapper") and launch.listeners("camera") == 2
-    launch = load_launch(find_launch(Path("camera")), [*given, "mapper.query=ask", "mapper.keys=k"])
-    assert (launch.options["foxglove"].query, launch.options["foxglove"].keys) == ("ask", "k")  # type: ignore[union-attr]
-    for change, says in (("foxglove.mapper=camera", "node 'foxglove' shows the map of 'camera', which is no mapper"),):
-        with pytest.raises(ConfigError, match=says):
-            load_launch(find_launch(Path("camera")), [*given, change])
 
 
 @pytest.mark.parametrize(
@@ -193,7 +191,7 @@ def test_foxglove_is_one_more_listener_and_queries_the_mapper() -> None:
         ([], ("[[node]]", '[[node]]\nname = "n"\nkind = "camera"\n' * 64 + "[[node]]"), "length <= 64"),
     ],
 )
-def test_mistakes_and_hostile_values_are_named_with_the_fix(
+def test_mistakes_are_named_with_the_fix(
     tmp_path: Path, settings: list[str], change: tuple[str, str], says: str
 ) -> None:
     path = file_of(tmp_path, SMALL.replace(*change, 1) if change[0] else SMALL)
@@ -212,9 +210,7 @@ def test_mistakes_and_hostile_values_are_named_with_the_fix(
         ('kind = "opencv", poses = { kind = "device" }', "do not track themselves, and no frame would have a pose"),
     ],
 )
-def test_mistakes_in_a_camera_and_its_poses_are_found_before_anything_starts(
-    tmp_path: Path, camera: str, says: str
-) -> None:
+def test_mistakes_in_a_camera_and_its_poses_are_found_before_a_start(tmp_path: Path, camera: str, says: str) -> None:
     text = SMALL.replace('log = ""\nmode = "realtime"', f"camera = {{ {camera} }}")
     with pytest.raises(ConfigError) as caught:
         load_launch(file_of(tmp_path, text))
@@ -226,14 +222,6 @@ def test_kinds_of_cameras_and_poses_are_those_of_the_drivers() -> None:
     assert tuple(semantic_mapper.drivers.poses.config.KINDS) == POSE_KINDS
 
 
-def test_files_without_a_camera_or_an_end_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no node of kind 'camera'"):
-        load_launch(file_of(tmp_path, "node = []"))
-    os.mkfifo(tmp_path / "fifo")
-    with pytest.raises(ConfigError, match="is no regular file"):
-        load_launch(tmp_path / "fifo")
-
-
 def test_files_that_are_there_come_before_those_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "replay").mkdir()  # a folder of that name is no launch file
@@ -243,3 +231,8 @@ def test_files_that_are_there_come_before_those_of_the_package(tmp_path: Path, m
     for name in ("replai", "elsewhere/replay", "../replay"):
         with pytest.raises(ConfigError, match=r"no such file; launch files that come with the package: .*replay"):
             find_launch(Path(name))
+    with pytest.raises(ConfigError, match="no node of kind 'camera'"):
+        load_launch(file_of(tmp_path, "node = []"))
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(ConfigError, match="is no regular file"):
+        load_launch(tmp_path / "fifo")

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
-from rich.console import Console
-
 from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.transport.messages import Status
 
@@ -37,22 +33,3 @@ def test_rates_losses_and_sizes_of_every_kind_of_node() -> None:
     assert nodes["recorder"]["rates_hz"] == {"recorded": 20.0, "messages": 30.0}
     assert nodes["recorder"]["lost"] == 4 * (1 + 2) and nodes["recorder"]["log_mb"] == 12.0
     assert nodes["player"]["rates_hz"] == {"published": 10.0} and nodes["player"]["lost"] is None
-
-
-def test_the_table_has_a_place_for_each() -> None:
-    console = Console(file=io.StringIO(), width=140)
-    console.print(view_after(4).table())
-    assert isinstance(console.file, io.StringIO)
-    lines = console.file.getvalue().splitlines()
-    heading = next(line for line in lines if "frames/s" in line)
-
-    def cell(node: str, column: str) -> str:
-        end = heading.index(column) + len(column)
-        row = next(line for line in lines if line.split()[:1] == [node])
-        return row[:end].split("  ")[-1].strip()
-
-    assert (cell("oak", "frames/s"), cell("oak", "lost")) == ("20.0", "4")
-    assert (cell("mapper", "frames/s"), cell("mapper", "mapped/s"), cell("mapper", "lost")) == ("18.0", "4.0", "16")
-    assert (cell("recorder", "frames/s"), cell("recorder", "msgs/s")) == ("20.0", "30.0")
-    assert (cell("recorder", "log MB"), cell("recorder", "lost")) == ("12.0", "12")
-    assert (cell("player", "frames/s"), cell("player", "lost")) == ("10.0", "")

@@ -1,9 +1,8 @@
-"""Notifications over a real datagram socket, and the unit file."""
+"""Where there is no systemd, and the unit file; what systemd is told: tests/nodes/test_faults.py."""
 
 from __future__ import annotations
 
 import shutil
-import socket
 import subprocess
 from pathlib import Path
 
@@ -14,30 +13,6 @@ from semantic_mapper.nodes.launcher.launcher import Notifier
 from tests.nodes.support import REPLAY_LAUNCH
 
 UNIT = REPLAY_LAUNCH.parent / "systemd" / "semantic-mapper.service"
-
-
-class Manager:
-    """What systemd would hear."""
-
-    def __init__(self, address: str) -> None:
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.bind(address)
-        self.socket.settimeout(5)
-
-    def hear(self) -> list[str]:
-        return self.socket.recv(4096).decode().split("\n")
-
-
-def test_what_is_told_is_what_systemd_expects(tmp_path: Path) -> None:
-    manager = Manager(str(tmp_path / "notify"))
-    notifier = Notifier.from_environment({"NOTIFY_SOCKET": str(tmp_path / "notify")})
-    notifier.ready("all well")
-    assert (manager.hear(), manager.hear()) == (["READY=1"], ["STATUS=all well"])
-    notifier.status("one")
-    notifier.status("one")
-    notifier.stopping(2.5)
-    assert manager.hear() == ["STATUS=one"]  # once
-    assert manager.hear() == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
 
 
 def test_without_systemd_nothing_is_sent_and_a_socket_that_is_gone_is_told_once(tmp_path: Path) -> None:

@@ -18,7 +18,16 @@ from semantic_mapper.nodes.mapper.saved_map import Autosave
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_paging import walk
 from tests.mapping.test_voxel_map import same
-from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_frames, run_ok, write_config, write_log
+from tests.nodes.support import (
+    REPLAY_LAUNCH,
+    Running,
+    eventually,
+    launch_settings,
+    repeated_frames,
+    run_ok,
+    write_config,
+    write_log,
+)
 
 ALWAYS = 1e-9  # seconds
 
@@ -30,14 +39,8 @@ def test_a_killed_mapper_leaves_the_map_of_a_frame(weights: Path, tmp_path: Path
     config = write_config(tmp_path / "fine.toml")
     config.write_text(config.read_text().replace("voxel_size_m = 0.05", "voxel_size_m = 0.015"), encoding="utf-8")
     out, again = tmp_path / "up", tmp_path / "again"
-    sets = [
-        f"camera.log={log}",
-        f"mapper.weights={weights}",
-        f"mapper.config={config}",
-        "mapper.save_every_s=0.3",
-        "mapper.query=",
-    ]
-    with Running("up", REPLAY_LAUNCH, *[w for s in sets for w in ("--set", s)], "--out", out) as running:
+    settings = launch_settings(log, weights, config, "mapper.save_every_s=0.3", "mapper.query=")
+    with Running("up", REPLAY_LAUNCH, *settings, "--out", out) as running:
         first = int(running.wait_for_line(r"map_saved").split("frames=")[1].split()[0])
         assert eventually(lambda: describe_map(out / "map.npz").frames > first)  # another in its place
         time.sleep(0.2)

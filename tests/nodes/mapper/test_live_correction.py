@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
@@ -28,7 +27,6 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.queries.questions import CorrectPosesRequest, encode_request
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode, encode_frame
@@ -37,7 +35,7 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.mapping.test_correction import drift, drifted, true_poses
 from tests.nodes.mapper.test_query_service import RawClient, a_folder
-from tests.nodes.support import CONFIG, eventually, node_here, run, run_ok
+from tests.nodes.support import CONFIG, NodeHere, eventually, node_here, refused, run_ok, summary_of
 from tests.replay.test_corrected_poses import write as write_tum
 from tests.small import INTRINSICS, tiny_frames
 
@@ -52,10 +50,8 @@ class Robot:
     query: str
     out: Path
     status: list[Status]
-    thread: threading.Thread
-    stop: StopRequest
+    node: NodeHere
     endpoints: dict[str, str]
-    weights: Path
 
     def send(self, frames: list[PosedFrame]) -> None:
         for frame in frames:
@@ -64,12 +60,11 @@ class Robot:
     def fused(self, count: int) -> bool:
         return eventually(lambda: bool(self.status) and self.status[-1].counters.get("fused", 0) >= count)
 
-    def end(self, published: int) -> dict[str, object]:
+    def end(self, published: int) -> dict[str, Any]:
         """End the stream; the summary."""
         self.camera.publish(encode(EndOfStream("test", "end", published)))
-        self.thread.join(100)
-        assert not self.thread.is_alive()
-        return json.loads((self.out / "summary.json").read_text())
+        self.node.wait()
+        return summary_of(self.out)
 
 
 def config_file(folder: Path, history: int = 100) -> Path:
@@ -83,22 +78,21 @@ def running_robot(
     weights: Path,
     out: Path,
     history: int = 100,
-    restarts: int = 0,
-    notes: Path | None = None,
     metadata: dict[str, str] | None = None,
+    context: dict[str, Any] | None = None,
     **more: Any,
 ) -> Iterator[Robot]:
     with a_folder() as folder:
         names = ("camera", "mapper", "query", "finetuner", "labels")
         endpoints = {name: f"ipc://{folder / name}" for name in names}
         options = MapperOptions(
-            out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all", **more
+            out=str(out), weights=str(weights), config=str(config_file(folder, history)), **{"delivery": "all", **more}
         )
         status: list[Status] = []
         ended = threading.Event()
         with (
             Publisher(endpoints["camera"], policy="block") as camera,
-            node_here(run_mapper, "mapper", endpoints, options, restarts=restarts, folder=notes) as (mapper, stop),
+            node_here(run_mapper, "mapper", endpoints, options, **context or {}) as mapper,
         ):
             for topic in ("info", "frame", "end"):
                 camera.wait_for_subscribers(topic, timeout_s=60)
@@ -114,10 +108,10 @@ def running_robot(
                 info = StreamInfo("test", {"rooms": INTRINSICS}, ROOMS, frame_hz=10.0, metadata=metadata or {})
                 camera.publish(encode(info))
                 try:
-                    yield Robot(camera, endpoints["query"], out, status, mapper, stop, endpoints, weights)
+                    yield Robot(camera, endpoints["query"], out, status, mapper, endpoints)
                 finally:
-                    stop.signum = 15
-                    mapper.join(60)
+                    mapper.stop.signum = 15
+                    mapper.thread.join(60)
                     ended.set()
                     ear.join()
 
@@ -169,38 +163,26 @@ def test_a_drifting_stream_that_is_corrected_midway_ends_as_the_map_of_true_pose
         assert ours[name].tobytes() == ideal[name].tobytes(), name
 
 
-def test_a_camera_that_closes_a_loop_moves_the_map(weights, tmp_path):
+@pytest.mark.slow
+def test_a_camera_that_closes_a_loop_and_a_file_move_the_map(weights, tmp_path):
     frames = tiny_frames(8)
-    late = drifted(frames)
     unseen = {frames[-1].stamp_ns + 10: np.eye(4)}  # of an image that was never mapped
     poses = {frame.stamp_ns: frame.T_world_camera for frame in frames}
+    far = dataclasses.replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**9)
     with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
-        robot.send(late)
+        robot.send(drifted(frames))
         assert robot.fused(8)
         with CorrectionSender(robot.query, frames[0].camera_id) as sender:
             sender.put(CorrectedWorld(poses | unseen, frames[-1].stamp_ns + 10, np.eye(4)))
             assert eventually(lambda: client.correction().completed == 1)
         assert sender.counters == {"corrections_sent": 1} and sender.warnings == ()
         assert client.correction().poses == 8
-        robot.end(8)
-
-
-@pytest.mark.slow
-def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
-    frames = tiny_frames(8)
-    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
-        robot.send(drifted(frames))
-        assert robot.fused(8)
-        far = dataclasses.replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**9)
         file = write_tum(tmp_path / "true.tum", [*frames[::2], far])
-        done = run_ok("query", robot.query, "correct", file, "--json")
-        outcome = json.loads(done.stdout)
-        assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 1, False)
-        far_file = write_tum(tmp_path / "far.tum", [far])
-        wrong = run("query", robot.query, "correct", far_file)
-        assert wrong.returncode == 1
-        assert "none of 1 poses was taken within 5 ms of a frame in the history (8 frames from 0.0" in wrong.stderr
-        assert client.correction().completed == 1 and robot.end(8)["map"]["corrected_poses"] == 4
+        outcome = json.loads(run_ok("query", robot.query, "correct", file, "--json").stdout)
+        assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 2, False)
+        said = refused("query", robot.query, "correct", write_tum(tmp_path / "far.tum", [far]))
+        assert "none of 1 poses was taken within 5 ms of a frame in the history (8 frames from 0.0" in said
+        robot.end(8)
 
 
 @contextmanager
@@ -226,28 +208,17 @@ def test_what_is_refused_says_why_and_changes_nothing(bundle_of):
     frames = tiny_frames(4)
     session = session_of(bundle_of(), [*frames, dataclasses.replace(frames[3], camera_id="rear")])
     pose, stamp = frames[1].T_world_camera, frames[1].stamp_ns
-    skewed = pose * 2
     with answered(session.pipeline) as (_, client):
         for poses, options, error, says in (
             ({}, {}, MapError, "none was given"),
-            ({stamp: skewed}, {}, PoseError, f"corrected pose of stamp {stamp}"),
+            ({stamp: pose * 2}, {}, PoseError, f"corrected pose of stamp {stamp}"),
             ({stamp: np.full((4, 4), np.nan)}, {}, PoseError, "NaN"),
             ({stamp: np.eye(3)}, {}, ShapeError, r"expected shape \(4, 4\)"),
-            (
-                {stamp + 2_000_000: pose},
-                {},
-                MapError,
-                "no frame with this stamp was mapped; of those in the history the nearest",
-            ),
+            ({stamp + 2_000_000: pose}, {}, MapError, "no frame with this stamp was mapped"),
             ({("side", stamp): pose}, {}, MapError, "of camera 'side': no frame"),
             ({frames[3].stamp_ns: pose}, {}, MapError, "cameras rear, rooms have this stamp"),
             ({stamp: pose}, {"within_ns": 1000}, MapError, "cameras rear, rooms; name one"),
-            (
-                {("rooms", stamp + 2000): pose},
-                {"within_ns": 1000},
-                MapError,
-                "none of 1 poses was taken within 0.001 ms",
-            ),
+            ({("rooms", stamp + 2000): pose}, {"within_ns": 1000}, MapError, "none of 1 poses was taken within"),
             ({stamp: pose}, {"within_ns": 10**10}, CodecError, "within_ns"),
             ({stamp: pose}, {"until_ns": -1}, CodecError, "until_ns"),
             ({("", stamp): pose, ("rooms", stamp): pose}, {}, CodecError, "must differ"),
@@ -259,13 +230,6 @@ def test_what_is_refused_says_why_and_changes_nothing(bundle_of):
         assert (near.used, near.running, near.total) == (1, True, 5)
     with answered(bundle_of(0).pipeline) as (_, client), pytest.raises(MapError, match=r"set history\.max_frames"):
         client.correct_poses({stamp: pose})
-    with (
-        a_folder() as folder,
-        QueryService(f"ipc://{folder / 'query'}", session.pipeline.voxel_map) as service,
-        MapClient(service.endpoint, timeout_s=60) as client,
-        pytest.raises(MapError, match="only answers questions"),
-    ):
-        client.correction()
 
 
 def test_corrected_poses_are_in_the_world_of_their_frames(bundle_of):
@@ -289,26 +253,25 @@ def test_corrected_poses_are_in_the_world_of_their_frames(bundle_of):
 def test_a_request_that_arrives_twice_counts_once(bundle_of):
     frames = tiny_frames(3)
     session = session_of(bundle_of(), drifted(frames))
+    arrays = {
+        "stamps_ns": np.array([f.stamp_ns for f in frames]),
+        "camera": np.zeros(3, np.uint8),
+        "poses": np.array([f.T_world_camera for f in frames]),
+    }
+    doubled = {name: np.concatenate((a, a)) for name, a in arrays.items()}
     with answered(session.pipeline) as (correction, client):
         raw = RawClient(client._socket.endpoint)
-        arrays = {
-            "stamps_ns": np.array([f.stamp_ns for f in frames]),
-            "camera": np.zeros(3, np.uint8),
-            "poses": np.array([f.T_world_camera for f in frames]),
-        }
-        request = CorrectPosesRequest(id="a", cameras=("",), **arrays)
-        parts = encode_request("correct_poses", request)
-        first = raw.ask([b"", *parts])
+
+        def ask(name: str, **arrays: np.ndarray) -> list[bytes]:
+            request = CorrectPosesRequest(id=name, cameras=("",), **arrays)
+            return raw.ask([b"", *encode_request("correct_poses", request)])
+
+        assert ask("a", **arrays)[0] == b"correct_poses"
         correction.advance(session, mapped=False)
-        second = raw.ask([b"", *parts])
-        assert first[0] == second[0] == b"correct_poses"
+        assert ask("a", **arrays)[0] == b"correct_poses"
         assert client.correction().done == 1  # goes on, and was not begun again
-        doubled = {name: np.concatenate((a, a)) for name, a in arrays.items()}
-        again = CorrectPosesRequest(id="b", cameras=("",), **doubled)
-        assert b"given twice" in raw.ask([b"", *encode_request("correct_poses", again)])[1]
-        uneven = msgspec.structs.replace(request, id="b", camera=np.zeros(2, np.uint8))
-        answer = raw.ask([b"", *encode_request("correct_poses", uneven)])
-        assert b"stamps, cameras, poses of shapes" in answer[1]
+        assert b"given twice" in ask("b", **doubled)[1]
+        assert b"stamps, cameras, poses of shapes" in ask("b", **arrays | {"camera": np.zeros(2, np.uint8)})[1]
         raw.socket.close()
         while correction.running:
             correction.advance(session, mapped=False)
@@ -329,7 +292,7 @@ def test_it_ends_although_frames_never_stop_coming(bundle_of):
     assert session.corrected_poses == 6
 
 
-def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
+def test_what_was_not_finished_or_fails_is_told_and_the_mapper_goes_on(bundle_of, monkeypatch):
     frames = tiny_frames(4)
     session = session_of(bundle_of(), drifted(frames))
     correction = LiveCorrection(session.pipeline)
@@ -341,13 +304,8 @@ def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
     assert len(waits) == 1 and "correction_unfinished" in [e["event"] for e in logs]
     assert session.unfinished_correction.endswith("stopped after 1 of 4 frames")
     arrays = {"stamps_ns": np.ones(1, np.int64), "camera": np.zeros(1, np.uint8), "poses": np.eye(4)[None]}
-    request = CorrectPosesRequest(id="late", cameras=("",), **arrays)
     with pytest.raises(MapError, match="the stream has ended"):
-        correction.begin(request)
-
-
-def test_a_correction_that_fails_leaves_the_mapper_running_and_is_told(bundle_of):
-    frames = tiny_frames(4)
+        correction.begin(CorrectPosesRequest(id="late", cameras=("",), **arrays))
     session = session_of(bundle_of(), drifted(frames))
     session.pipeline.corrector.start(true_poses(frames, 1))
     session.pipeline.corrector._end_history("the disk is full")

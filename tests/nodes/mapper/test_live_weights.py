@@ -22,7 +22,7 @@ from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from tests.nodes.mapper.test_live_correction import Robot, running_robot
-from tests.nodes.support import eventually, run_here
+from tests.nodes.support import eventually, run_ok
 from tests.small import SMALL_MODEL, tiny_frames
 from tests.training.test_online import CONFIG, permuted, pool_of, start_of
 
@@ -112,8 +112,8 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
         assert [v.state for v in state.versions] == ["earlier", "earlier", "in use"]
         learner.client.return_to_weights(1)
         assert eventually(lambda: learner.client.weights().in_use == 1)
-        code, text = run_here("info", learner.robot.query)
-        assert code == 0 and "weights 1 in use; 2 times taken, 0 refused, 1 rolled back" in text, text
+        said = " ".join(run_ok("info", learner.robot.query).stdout.split())
+        assert "weights 1 in use; 2 times taken, 0 refused, 1 rolled back" in said
         state = learner.client.weights()
         assert (state.in_use, state.before, state.rolled_back) == (1, 0, 1)
         assert [v.state for v in state.versions] == ["earlier", "in use", "rolled back"]
@@ -183,12 +183,12 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
 def test_a_restarted_mapper_goes_on_with_the_weights_that_its_forerunner_used(learned, tmp_path):
     notes = tmp_path / "notes"
     notes.mkdir()
-    with learning_robot(learned, tmp_path / "out", notes=notes, min_map_agreement=0.0) as learner:
+    with learning_robot(learned, tmp_path / "out", context={"folder": notes}, min_map_agreement=0.0) as learner:
         assert learner.offer(misled(learned), 1).accepted  # the learner has the last word
         assert learner.offer(better(learned), 3).version == 3
         digest = learner.in_use().digest
         learner.robot.end(6)
-    with learning_robot(learned, tmp_path / "out", notes=notes, restarts=1) as learner:
+    with learning_robot(learned, tmp_path / "out", context={"folder": notes, "restarts": 1}) as learner:
         assert eventually(lambda: learner.in_use().version == 3)
         assert (learner.in_use().digest, learner.in_use().newest) == (digest, 3)
         assert learner.client.weights().before == 0

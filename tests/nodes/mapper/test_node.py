@@ -14,34 +14,29 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.saved_map import resume_map
-from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN
 from tests.nodes.mapper.test_live_correction import running_robot, settle, true_poses
 from tests.nodes.mapper.test_resume import context
-from tests.nodes.support import eventually, run_here
+from tests.nodes.support import eventually, refused, run_ok
 from tests.small import tiny_frames
 
 
-def test_a_failure_to_write_does_not_hide_what_ended_the_run(
-    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_to_write_hides_no_other_one(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = Mock(side_effect=MapError("map.npz: no space left"))
     monkeypatch.setattr("semantic_mapper.nodes.mapper.node.finish_session", full)
     monkeypatch.setattr("semantic_mapper.replay.session.MapSession.process", full)
-    with capture_logs() as logs, running_robot(weights, tmp_path / "out", 0) as robot:
+    with capture_logs() as logs, running_robot(weights, tmp_path / "out", 0, context={"fails": True}) as robot:
         robot.send(list(tiny_frames(1)))
-        robot.thread.join(60)
+        robot.node.wait(60)
     assert [log["event"] for log in logs if log["log_level"] == "error"] == ["results_not_written"]
 
 
 @pytest.mark.parametrize("noted", [True, False])
-def test_a_correction_that_cannot_be_noted_ends_the_saving_and_not_the_mapper(
-    weights: Path, tmp_path: Path, noted: bool
-) -> None:
+def test_a_correction_that_cannot_be_noted_ends_only_the_saving(weights: Path, tmp_path: Path, noted: bool) -> None:
     frames, notes, out = tiny_frames(4), tmp_path / "notes", tmp_path / "out"
     notes.mkdir()
     with (
-        running_robot(weights, out, notes=notes, save_every_s=1e-3) as robot,
+        running_robot(weights, out, context={"folder": notes}, save_every_s=1e-3) as robot,
         MapClient(robot.query, timeout_s=60) as client,
     ):
         robot.send(list(frames))
@@ -69,14 +64,10 @@ def test_a_live_map_without_metres(weights: Path, tmp_path: Path) -> None:
         assert robot.fused(4)
         assert eventually(lambda: client.info().version >= 4) and not client.info().scale_known
         assert any(line.startswith("scale: unknown") for line in robot.status[-1].degraded)
-        with pytest.raises(MapError, match="scale is unknown; give a scale"):
-            client.nearest("floor", (0, 0, 0))
-        with pytest.raises(MapError, match="scale is unknown"):
-            client.instances()
-        snapshot = client.mirror().snapshot()  # shown and counted all the same
-        assert snapshot.block_count > 0
-        with pytest.raises(MapError, match="scale is unknown"):
-            nearest(snapshot, "floor", (0, 0, 0))
+        for ask in (lambda: client.nearest("floor", (0, 0, 0)), client.instances):
+            with pytest.raises(MapError, match="scale is unknown"):
+                ask()
+        assert client.mirror().snapshot().block_count > 0  # shown and counted all the same
         client.correct_poses(true_poses(frames, 1))
         settle(client)
         assert eventually(lambda: client.info().epoch == 1) and not client.info().scale_known
@@ -86,19 +77,16 @@ def test_a_live_map_without_metres(weights: Path, tmp_path: Path) -> None:
 
 
 def test_what_the_command_says_of_a_saved_map_without_metres(replayed: Path, tmp_path: Path) -> None:
-    voxel_map = VoxelMap.load(replayed / "map.npz")
+    voxel_map, saved, plan = VoxelMap.load(replayed / "map.npz"), tmp_path / "map.npz", tmp_path / "plan.yaml"
     voxel_map.note_scale(False)
-    saved = tmp_path / "map.npz"
     voxel_map.save(saved)
-    code, said = run_here("query", saved, "nearest", "floor", "0", "0", "0")
-    assert code == 1 and "scale is unknown; give a scale" in " ".join(said.split())
-    code, said = run_here("query", saved, "info", "--json")
-    assert code == 0 and json.loads(said)["scale"] == SCALE_UNKNOWN
-    code, said = run_here("info", saved)
-    assert code == 0 and "units (scale unknown)" in said and " cm" not in said
-    code, said = run_here("export", saved, "--out", tmp_path / "plan.yaml")
-    assert code == 1 and "scale is unknown" in " ".join(said.split()) and not (tmp_path / "plan.yaml").exists()
-    code, said = run_here("merge", saved, replayed, "--out", tmp_path / "both.npz")
-    assert code == 1 and "scale of the other is unknown" in " ".join(said.split())
-    code, said = run_here("compare", saved, replayed)
-    assert code == 2 and "scale of the other is unknown" in " ".join(said.split())
+    assert json.loads(run_ok("query", saved, "info", "--json").stdout)["scale"] == SCALE_UNKNOWN
+    said = run_ok("info", saved).stdout
+    assert "units (scale unknown)" in said and " cm" not in said
+    for said, words in (
+        ("scale is unknown; give a scale", ("query", saved, "nearest", "floor", "0", "0", "0")),
+        ("scale is unknown", ("export", saved, "--out", plan)),
+        ("scale of the other is unknown", ("merge", saved, replayed, "--out", tmp_path / "both.npz")),
+    ):
+        assert said in refused(*words)
+    assert "scale of the other is unknown" in refused("compare", saved, replayed, code=2) and not plan.exists()

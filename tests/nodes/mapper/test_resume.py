@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +15,11 @@ from semantic_mapper.localization.features import Features
 from semantic_mapper.localization.places import make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
-from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.saved_map import continue_map, forbid, keep_earlier, resume_map, stored_settings
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.messages import EndOfStream, StreamInfo
-from semantic_mapper.transport.sockets import Publisher
 from tests.mapping.test_voxel_map import same
-from tests.nodes.support import node_here
+from tests.nodes.mapper.test_live_correction import running_robot
 from tests.small import INTRINSICS, tiny_frames
 
 CONFIG = VoxelMapConfig(voxel_size_m=0.05)
@@ -39,13 +33,8 @@ def context(folder: Path, restarts: int) -> NodeContext:
 def some_map(frames: int) -> VoxelMap:
     made = VoxelMap(CONFIG, ROOMS)
     for frame in tiny_frames(6)[:frames]:
-        assert frame.depth_m is not None
         made.integrate(frame, frame.depth_m, None)
     return made
-
-
-def assert_same(left: VoxelMap, right: VoxelMap) -> None:
-    assert same(left.block_state(), right.block_state())
 
 
 def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp_path: Path) -> None:
@@ -60,10 +49,9 @@ def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp
     said = resume_map(context(folder, 1), path, resumed)
     assert said == "the mapper was restarted and went on from the map saved after 3 frames"
     for frame in tiny_frames(6)[3:]:
-        assert frame.depth_m is not None
         resumed.integrate(frame, frame.depth_m, None)
     assert resumed.frames == 6
-    assert_same(resumed, some_map(6))
+    assert same(resumed.block_state(), some_map(6).block_state())
 
 
 def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_means(tmp_path: Path) -> None:
@@ -77,7 +65,7 @@ def test_a_run_that_goes_on_keeps_its_settings_but_for_what_the_stored_data_mean
     loaded, fresh = VoxelMap.load(path, config=settings), VoxelMap(settings, ROOMS)
     assert loaded.config == settings
     fresh.take_over(loaded)
-    assert_same(fresh, some_map(2))
+    assert same(fresh.block_state(), some_map(2).block_state())
     other = stored_settings(MapperConfig(), None, 0.02, path).voxel_map
     with pytest.raises(ConfigError, match=r"map.npz: was made with voxel_map.voxel_size_m = 0.05 .* 0.02: leave"):
         VoxelMap.load(path, config=other)
@@ -149,31 +137,20 @@ def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -
     assert path.read_bytes() == contents[2]
 
 
-def map_stream(options: MapperOptions) -> None:
-    """A mapper from the beginning of a stream to its end."""
-    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
-        endpoints = {name: f"ipc://{folder}/{name}" for name in ("camera", "mapper")}
-        with (
-            Publisher(endpoints["camera"], policy="block") as camera,
-            node_here(run_mapper, "mapper", endpoints, options, folder=Path(folder)) as (thread, _),
-        ):
-            camera.wait_for_subscribers("frame", timeout_s=200)
-            camera.publish(encode(StreamInfo("a wall", {"rooms": INTRINSICS}, ROOMS), sender="camera"))
-            camera.publish(encode_frame(tiny_frames(1)[0]), 120)
-            camera.publish(encode(EndOfStream("camera", "end", 1)), 120)
-            thread.join(200)
+def test_a_live_launch_keeps_earlier_results_a_replay_replaces_them(tmp_path: Path, weights: Path) -> None:
+    out, results = tmp_path / "out", {"map.npz", "map.ply", "overview.png", "report.html", "summary.json"}
 
+    def map_a_frame(delivery: str) -> None:
+        (notes := tmp_path / "notes").mkdir(exist_ok=True)
+        with running_robot(weights, out, 0, context={"folder": notes}, delivery=delivery) as robot:
+            robot.send(list(tiny_frames(1)))
+            robot.end(1)
 
-def test_live_launch_into_the_same_folder_keeps_the_map_and_a_replay_replaces_it(
-    tmp_path: Path, weights: Path, config: Path
-) -> None:
-    live = MapperOptions(out=str(tmp_path), weights=str(weights), config=str(config), query="")
-    map_stream(live)
-    first = (tmp_path / "map.npz").read_bytes()
-    map_stream(live)
-    (kept,) = tmp_path.glob("earlier-*")
+    map_a_frame("newest")
+    first = (out / "map.npz").read_bytes()
+    map_a_frame("newest")
+    (kept,) = out.glob("earlier-*")
     assert (kept / "map.npz").read_bytes() == first
-    results = {"map.npz", "map.ply", "overview.png", "report.html", "summary.json"}
-    assert {p.name for p in kept.iterdir()} == results == {p.name for p in tmp_path.iterdir() if p.is_file()}
-    map_stream(MapperOptions(out=str(tmp_path), weights=str(weights), config=str(config), query="", delivery="all"))
-    assert list(tmp_path.glob("earlier-*")) == [kept]
+    assert {p.name for p in kept.iterdir()} == results == {p.name for p in out.iterdir() if p.is_file()}
+    map_a_frame("all")
+    assert list(out.glob("earlier-*")) == [kept]

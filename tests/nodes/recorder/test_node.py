@@ -8,7 +8,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,20 +20,28 @@ import pytest
 from structlog.testing import capture_logs
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import LogError, TransportError
 from semantic_mapper.nodes.cli.info import describe_log
 from semantic_mapper.nodes.launcher.launch_file import NodeEntry
 from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, read_launch_note
-from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
-from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
-from tests.nodes.support import Running, error_line, eventually, node_here, repeated_frames, run, run_ok, write_log
+from tests.nodes.mapper.test_query_service import a_folder
+from tests.nodes.support import (
+    NodeHere,
+    Running,
+    error_line,
+    eventually,
+    node_here,
+    repeated_frames,
+    run,
+    run_ok,
+    write_log,
+)
 from tests.nodes.test_faults import alone
 from tests.transport import samples
 
@@ -61,10 +69,8 @@ class Stream:
     """A camera that publishes what a test says, and a recorder node that listens."""
 
     publisher: Publisher
-    recorder: threading.Thread
+    recorder: NodeHere
     status: NewestSubscriber
-    failures: list[BaseException]
-    stop: StopRequest
 
     def publish(self, *frames: int) -> None:
         for seq in frames:
@@ -72,65 +78,47 @@ class Stream:
 
     def end(self) -> None:
         self.publisher.publish(encode(EndOfStream("camera", "end", 0)))
-        self.recorder.join(60)
-        assert not self.recorder.is_alive() and not self.failures
+        self.recorder.wait(60)
 
-    def last_status(self) -> Status:
+    def wait_for_status(self, holds: Callable[[Status], bool]) -> Status:
+        for _ in range(100):
+            status = self.status.receive(1.0)
+            if isinstance(status, Status) and holds(status):
+                return status
+        raise AssertionError("the recorder never said so")
+
+    def last_counters(self) -> Mapping[str, int]:
         """What the recorder said when it had closed its log."""
-        for _ in range(100):
-            status = self.status.receive(1.0)
-            if isinstance(status, Status) and status.state == "ended":
-                return status
-        raise AssertionError("the recorder never said that it has ended")
-
-    def wait_for_status(self, wanted: str) -> Status:
-        for _ in range(100):
-            status = self.status.receive(1.0)
-            if isinstance(status, Status) and any(wanted in text for text in status.degraded):
-                return status
-        raise AssertionError(f"the recorder never said '{wanted}'")
+        return self.wait_for_status(lambda status: status.state == "ended").counters
 
 
 @contextmanager
-def streaming(tmp_path: Path, sockets: Path, restarts: int = 0, **options: Any) -> Iterator[Stream]:
+def streaming(tmp_path: Path, sockets: Path, *, fails: bool = False, **options: Any) -> Iterator[Stream]:
     endpoints = {name: f"ipc://{sockets}/{name}" for name in ("camera", "recorder")}
     settings = convert_config({"out": str(tmp_path / "a.mcap"), "sources": ["camera"], **options}, RecorderOptions, "t")
-    failures: list[BaseException] = []
-
-    def work(context: NodeContext, settings: RecorderOptions) -> None:
-        try:
-            run_recorder(context, settings)
-        except (LogError, TransportError) as error:
-            failures.append(error)
-
     with (
         Publisher(endpoints["camera"], policy="block") as publisher,
-        node_here(work, "recorder", endpoints, settings, restarts=restarts, folder=sockets) as (recorder, stop),
+        node_here(run_recorder, "recorder", endpoints, settings, fails=fails, folder=sockets) as recorder,
         NewestSubscriber(endpoints["recorder"], ("status",)) as status,
     ):
         publisher.wait_for_subscribers("frame", 1, 30)
         publisher.publish(encode(samples.make_info(), sender="camera"))
-        yield Stream(publisher, recorder, status, failures, stop)
+        yield Stream(publisher, recorder, status)
 
 
 @pytest.fixture
-def sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    folder = Path(f"/tmp/sm-{os.getpid()}-{tmp_path_factory.mktemp('s').name}")
-    folder.mkdir()
-    yield folder
-    for file in folder.iterdir():
-        file.unlink()
-    folder.rmdir()
+def sockets() -> Iterator[Path]:
+    with a_folder() as folder:
+        yield folder
 
 
 def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -> None:
-    with capture_logs() as told, streaming(tmp_path, sockets, reserve_mb=0) as stream:
+    with capture_logs() as told, streaming(tmp_path, sockets, fails=True, reserve_mb=0) as stream:
         stream.publish(*range(4))
         assert eventually((tmp_path / "a.mcap").exists, 30)
         (tmp_path / "a.mcap").unlink()
-        stream.publisher.publish(encode(EndOfStream("camera", "end", 0)))
-        stream.recorder.join(60)
-        assert len(stream.failures) == 1 and "a.mcap: was removed while it was written" in str(stream.failures[0])
+        stream.end()
+    assert "a.mcap: was removed while it was written" in str(stream.recorder.error)
     events = [entry["event"] for entry in told]
     assert "recording_gone" in events and "recorded" not in events
 
@@ -143,7 +131,7 @@ def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path,
         topic = encode_frame(samples.make_frame(30))[0]
         stream.publisher.publish([topic, b"no header"])
         stream.end()
-        told = stream.last_status().counters
+        told = stream.last_counters()
     parts = list(parts_on_disk(tmp_path / "a.mcap").values())
     assert len(parts) > 1
     assert (told["recorded"], told["missed"], told["rejected"], told["lost"]) == (28, 2, 1, 0)
@@ -153,7 +141,6 @@ def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path,
         assert [f.seq for f in frames] == [*range(10), *range(12, 30)] and not log.errors
         for frame in frames:
             sent = samples.make_frame(frame.seq)
-            assert frame.depth_m is not None and sent.depth_m is not None and frame.label is not None
             assert frame.depth_m.tobytes() == sent.depth_m.tobytes() and np.array_equal(frame.label, sent.label)
             assert not np.array_equal(frame.rgb, sent.rgb)  # noise, the worst there is for JPEG
         _, wire = next(log.frame_parts())
@@ -176,9 +163,7 @@ def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path,
         (False, "reserve_mb = 1e12", r"messages? not written: .*the disk is full"),
     ],
 )
-def test_a_launch_whose_recorder_has_lost_frames_does_not_end_well(
-    tmp_path: Path, kill: bool, extra: str, reason: str
-) -> None:
+def test_a_launch_whose_recorder_lost_frames_ends_badly(tmp_path: Path, kill: bool, extra: str, reason: str) -> None:
     log = write_log(tmp_path / "long.mcap", repeated_frames(600 if kill else 20))
     policy, option = (extra, "") if "restart" in extra else ("", extra)
     launch = tmp_path / "recorded.toml"
@@ -200,16 +185,14 @@ def test_a_launch_whose_recorder_has_lost_frames_does_not_end_well(
 def test_full_disk_is_told_and_the_stream_goes_on(tmp_path: Path, sockets: Path) -> None:
     with streaming(tmp_path, sockets, reserve_mb=1e12) as stream:
         stream.publish(*range(100))  # would block if nobody read on
-        status = stream.wait_for_status("the disk is full")
+        status = stream.wait_for_status(lambda status: "the disk is full" in " ".join(status.degraded))
         assert "recording has stopped" in status.degraded[0] and status.counters["recorded"] == 0
         stream.end()
     with LogReader(tmp_path / "a.mcap", allow_empty=True) as log:
         assert log.finished and len(log) == 0
 
 
-def test_what_waits_when_the_recorder_is_stopped_is_written(
-    tmp_path: Path, sockets: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_waits_at_a_stop_is_written(tmp_path: Path, sockets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taking, go_on, take = threading.Event(), threading.Event(), Recorder.take
 
     def slowly(recorder: Recorder, parts: list[bytes]) -> bool:
@@ -224,12 +207,11 @@ def test_what_waits_when_the_recorder_is_stopped_is_written(
         stream.publish(0)
         assert taking.wait(30)
         stream.publish(*range(1, 40))
-        stream.stop.signum = signal.SIGTERM
+        stream.recorder.stop.signum = signal.SIGTERM
         time.sleep(0.3)  # until all have come
         go_on.set()
-        stream.recorder.join(60)
-        assert not stream.recorder.is_alive() and not stream.failures
-        told = stream.last_status().counters
+        stream.recorder.wait(60)
+        told = stream.last_counters()
     with LogReader(tmp_path / "a.mcap") as log:
         assert [envelope.seq for envelope, _ in log.frame_parts()] == list(range(40))
     assert (told["recorded"], told["lost"]) == (40, 0)

@@ -37,7 +37,7 @@ from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import Publisher
 from tests.nodes.foxglove.robot import update_for
 from tests.nodes.mapper.test_query_service import answering
-from tests.nodes.support import error_line, eventually, is_alive, run
+from tests.nodes.support import addresses_listening, error_line, eventually, is_alive, run
 from tests.queries.scene import LABELS, painted, whole_map
 from tests.small import tiny_config, tiny_frames
 
@@ -52,18 +52,13 @@ def logged(path: Path) -> Counter[str]:
     return rows
 
 
-def listening(port: int) -> set[str]:
-    """Addresses on which somebody listens to a port, as the kernel writes them."""
-    lines = Path("/proc/net/tcp").read_text().splitlines()[1:] + Path("/proc/net/tcp6").read_text().splitlines()[1:]
-    sockets = (line.split() for line in lines)
-    return {s[1].split(":")[0] for s in sockets if s[3] == "0A" and int(s[1].split(":")[1], 16) == port}
-
-
 def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
     with WebViewer(0, 0) as viewer:
         page, data = urlsplit(viewer.page_url), urlsplit(viewer.data_url)
         assert parse_qs(page.query)["url"] == [viewer.data_url]
-        assert page.port and data.port and listening(page.port) == listening(data.port) == {"0100007F"}
+        assert (
+            page.port and data.port and addresses_listening(page.port) == addresses_listening(data.port) == {"0100007F"}
+        )
         connection = http.client.HTTPConnection(page.hostname or "", page.port, timeout=10)
         connection.request("GET", f"/?{page.query}")
         answer = connection.getresponse()
@@ -83,7 +78,7 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
         with pytest.raises(TransportError, match=f"port {page.port} cannot be had"):
             WebViewer(page.port, 0).__enter__()
         pid = viewer.pid
-    assert not is_alive(pid) and not listening(page.port) and not listening(data.port)
+    assert not is_alive(pid) and not addresses_listening(page.port) and not addresses_listening(data.port)
     assert not settings.exists()
 
 
@@ -91,14 +86,12 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
 def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Path) -> None:
     for name in ("map.npz", "log.mcap", "text"):
         (tmp_path / name).write_bytes(b"neither of these" * 100)
-    words = {
-        tmp_path / "map.npz": "damaged or not a map",
-        tmp_path / "log.mcap": "not an MCAP log",
-        tmp_path / "text": "no socket folder of a launch",
-        tmp_path / "nope": "no such file, and no socket folder of a launch",
-        "tcp://10.1.2.3:5570": "without keys",
-    }
-    for source, reason in words.items():
+    for source, reason in (
+        (tmp_path / "map.npz", "damaged or not a map"),
+        (tmp_path / "log.mcap", "not an MCAP log"),
+        (tmp_path / "text", "no socket folder of a launch"),
+        ("tcp://10.1.2.3:5570", "without keys"),
+    ):
         done = run("view", source, "--port", "0")
         assert done.returncode == 1 and reason in error_line(done.stderr)
         assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
@@ -120,7 +113,6 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
         "with WebViewer(0, 0) as viewer:\n    print(viewer.pid, flush=True)\n    time.sleep(600)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         server = int(process.stdout.readline())
         assert is_alive(server)
         process.send_signal(signal.SIGKILL)
