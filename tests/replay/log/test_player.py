@@ -70,11 +70,15 @@ def play_to(
     return report, mapper
 
 
-def test_lockstep_drops_nothing_however_slow_the_mapper_is(small_log: Path, endpoint: str) -> None:
+def test_lockstep_drops_nothing_however_slow_the_mapper_is_and_a_refusal_is_an_answer_too(
+    small_log: Path, endpoint: str
+) -> None:
     pause = threading.Event()
 
     def slowly(frame: PosedFrame) -> list[bytes]:
         pause.wait(0.02)
+        if frame.seq == 3:
+            return encode(FrameRefused(frame.stamp_ns, 3, frame.camera_id, "pose holds NaN"))
         return fuse(frame)
 
     report, mapper = play_to(small_log, endpoint, slowly)
@@ -83,16 +87,6 @@ def test_lockstep_drops_nothing_however_slow_the_mapper_is(small_log: Path, endp
     info, end = mapper.received[0], mapper.received[-1]
     assert isinstance(info, StreamInfo) and info.frame_count == FRAMES
     assert end == EndOfStream("player", "end", FRAMES)
-
-
-def test_a_refusal_is_an_answer_too(small_log: Path, endpoint: str) -> None:
-    def answer(frame: PosedFrame) -> list[bytes]:
-        if frame.seq == 3:
-            return encode(FrameRefused(frame.stamp_ns, 3, frame.camera_id, "pose holds NaN"))
-        return fuse(frame)
-
-    report, _ = play_to(small_log, endpoint, answer)
-    assert report.published == FRAMES
 
 
 def test_a_mapper_that_does_not_answer_ends_the_playing_with_a_clear_error(small_log: Path, endpoint: str) -> None:
@@ -145,24 +139,20 @@ def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: s
     assert isinstance(end, EndOfStream) and end.unreadable == 1 and "seq=1" in end.damages[0]
 
 
-def test_playing_fast_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoint: str) -> None:
+@pytest.mark.parametrize("options", [PlayOptions("fast", max_frames=7), PlayOptions("realtime", 1e3, max_frames=7)])
+def test_playing_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoint: str, options: PlayOptions) -> None:
     seqs: list[int] = []
     with (
         LogReader(small_log) as reader,
         Publisher(endpoint, policy="block", hwm=1) as publisher,
         LosslessSubscriber(endpoint, ["frame", "end"], hwm=1) as subscriber,
     ):
-        thread = threading.Thread(target=lambda: play(reader, publisher, None, PlayOptions(mode="fast", max_frames=7)))
+        thread = threading.Thread(target=lambda: play(reader, publisher, None, options))
         thread.start()
         while isinstance(message := subscriber.receive(WAIT_S), PosedFrame):
             seqs.append(message.seq)
         thread.join()
     assert seqs == list(range(7)) and isinstance(message, EndOfStream)
-
-
-def test_real_time_keeps_the_order_and_sends_all(small_log: Path, endpoint: str) -> None:
-    report, mapper = play_to(small_log, endpoint, lambda _: None, mode="realtime", rate=1000.0)
-    assert report.published == FRAMES and mapper.seqs == sorted(mapper.seqs) and mapper.seqs[-1] == FRAMES - 1
 
 
 def test_playing_can_be_stopped(small_log: Path, endpoint: str) -> None:
