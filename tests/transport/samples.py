@@ -91,9 +91,7 @@ def all_messages() -> dict[str, list[bytes]]:
         "frame": encode_frame(make_frame()),
         "map": encode(make_update()),
         "refused": encode(FrameRefused(4, 5, CAMERA, "pose holds NaN")),
-        "status": encode(
-            Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU; running on the CPU",))
-        ),
+        "status": encode(make_status()),
         "info": encode(make_info()),
         "end": encode(EndOfStream("player", "end", 200)),
         "keyframe": encode(LabelledKeyframe(make_frame(), NYU40, "a person")),
@@ -107,6 +105,10 @@ def frame_variants() -> list[list[bytes]]:
     options = [CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg", depth_scale=999.0)]
     frames = [make_frame(), make_frame(depth=False), make_frame(label=False), make_frame(depth=False, label=False)]
     return [encode_frame(frame, option) for option in options for frame in frames]
+
+
+def with_header(parts: Sequence[bytes], **changes: object) -> list[bytes]:
+    return [parts[0], msgpack.packb({**msgpack.unpackb(parts[1]), **changes}), *parts[2:]]
 
 
 def deep_bomb(depth: int) -> bytes:

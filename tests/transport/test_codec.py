@@ -36,6 +36,7 @@ from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_B
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 from . import samples
+from .samples import with_header
 
 sizes = st.tuples(st.integers(1, 20), st.integers(1, 20))
 camera_ids = st.from_regex(r"[A-Za-z0-9_.:-]{1,64}", fullmatch=True)
@@ -158,11 +159,6 @@ def allocates_nothing() -> Iterator[None]:
         tracemalloc.stop()
 
 
-def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
-    header = {**msgpack.unpackb(parts[1]), **changes}
-    return [parts[0], msgpack.packb(header), *parts[2:]]
-
-
 def lens(width: int, height: int) -> dict[str, float]:
     """Intrinsics of an ordinary camera, as the header has them."""
     return {"fx": width, "fy": width, "cx": width / 2, "cy": height / 2, "width": width, "height": height}
@@ -211,6 +207,12 @@ def test_a_wrong_header_is_refused_by_its_field(changes: dict[str, object], comp
     parts = with_header(encode_frame(samples.make_frame(), CodecOptions(rgb=rgb)), **changes)
     with allocates_nothing(), pytest.raises(CodecError, match=complaint):
         decode(parts)
+
+
+@pytest.mark.parametrize("topic", b" frame frame/ frame/a frame/a/b/ frames/a/ \xff/a/ frame/\x01/".split(b" "))
+def test_foreign_topics_are_refused(topic: bytes) -> None:
+    with pytest.raises(CodecError, match="unknown topic"):
+        decode([topic, b"\x80"])
 
 
 def test_bombs_in_buffers_are_refused_before_they_unfold() -> None:

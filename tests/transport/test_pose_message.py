@@ -11,36 +11,30 @@ from semantic_mapper.transport.pose_message import decode_pose
 PLAIN = {"v": 1, "stamp_ns": 5, "position": [1.0, 2.0, 3.0], "quaternion": [0.0, 0.0, 0.0, 1.0]}
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"v": 2}, "version"),
-        ({"stamp_ns": -1}, "stamp_ns"),
-        ({"stamp_ns": 1.5}, "stamp_ns"),
-        ({"position": [1.0, 2.0]}, "position"),
-        ({"position": [1.0, 2.0, math.nan]}, "finite"),
-        ({"quaternion": [0.0, 0.0, 0.0, 0.5]}, "length 0.5"),
-        ({"quaternion": [0.0, 0.0, 0.0, math.inf]}, "finite"),
-        ({"sigma": -0.1}, "sigma"),
-        ({"parent": "x" * 65}, "parent"),
-        ({"frame": "odom"}, "frame"),
-    ],
-)
-def test_a_bad_field_is_named(change: dict[str, object], reason: str) -> None:
-    with pytest.raises(CodecError, match=reason):
-        decode_pose([msgpack.packb({**PLAIN, **change})])
+FIELDS = {
+    "version": {"v": 2},
+    "stamp_ns": {"stamp_ns": 1.5},
+    "position": {"position": [1.0, 2.0]},
+    "finite": {"position": [1.0, 2.0, math.nan]},
+    "length 0.5": {"quaternion": [0.0, 0.0, 0.0, 0.5]},
+    "finite .*quaternion": {"quaternion": [0.0, 0.0, 0.0, math.inf]},
+    "sigma": {"sigma": -0.1},
+    "parent": {"parent": "x" * 65},
+    "frame": {"frame": "odom"},
+}
 
 
 @pytest.mark.parametrize(
     ("parts", "reason"),
     [
+        *(([msgpack.packb({**PLAIN, **change})], reason) for reason, change in FIELDS.items()),
         ([b"{" + b" " * 2048], "2049 bytes"),
         ([b""], "0 bytes"),
         ([b"a", b"b", b"c"], "3 parts"),
-        ([b"[" * 2000], ""),
+        ([b"[" * 2000], "bad header"),
         ([b'{"a":' * 400], "not JSON"),
     ],
 )
-def test_sizes_are_bounded_before_anything_is_parsed(parts: list[bytes], reason: str) -> None:
+def test_what_is_no_pose_is_refused_with_what_is_wrong(parts: list[bytes], reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
         decode_pose(parts)

@@ -20,16 +20,14 @@ from semantic_mapper.queries.questions import (
 )
 from semantic_mapper.types import UInt8
 
+from .samples import with_header
+
 STATE = MapState("m", 7, 1)
 POINTS = np.random.default_rng(3).normal(size=(5, 3))
 
 
-def at_request(points: np.ndarray = POINTS) -> list[bytes]:
-    return encode_request("at", AtRequest(points=points, radius_m=0.1))
-
-
-def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
-    return [parts[0], msgpack.packb({**msgpack.unpackb(parts[1]), **changes}), *parts[2:]]
+def at_request() -> list[bytes]:
+    return encode_request("at", AtRequest(points=POINTS, radius_m=0.1))
 
 
 def with_points(**changes: object) -> list[bytes]:
