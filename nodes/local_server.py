@@ -20,11 +20,7 @@ class LocalServer(ThreadingHTTPServer):
     """Serves each request in a thread, from when it is made until the context ends; a request that fails is one line in
     the log, and the next one is served.
 
-    Raises TransportError: the port is taken.
-
-    Args:
-        port: Of this machine; 0 = any that is free.
-        handler: Of requests.
+    ``port`` 0 = any that is free. Raises TransportError: the port is taken.
     """
 
     daemon_threads = True

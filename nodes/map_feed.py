@@ -28,9 +28,8 @@ _log = structlog.get_logger(__name__)
 class MapFollower:
     """Looks at a map again and again, in a thread of its own, and once more at the end; a context manager.
 
-    Args:
-        look: May raise errors of ours: a mapper that starts has no map for a while.
-        refresh_s: Between two looks, at least; and ``pause`` times as long as the last one took.
+    ``look`` may raise errors of ours: a mapper that starts has no map for a while. Between two looks are ``refresh_s``
+    at least, and ``pause`` times as long as the last one took.
     """
 
     def __init__(self, look: Callable[[], None], refresh_s: float, pause: float = 0.0) -> None:

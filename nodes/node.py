@@ -70,9 +70,7 @@ def run_node(kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], str |
     In a launch only the launcher's ``STOP_SIGNAL`` asks for an end that is one: after SIGTERM or SIGINT of anybody
     else, a restartable node does what it does at its end, and exits with 128 + the signal's number.
 
-    Args:
-        kind: Of its options.
-        work: Does it all; looks at ``stop`` often. Returns what is lost, in words, if anything.
+    ``work`` does it all; it looks at ``stop`` often, and returns what is lost, in words, if anything.
     """
     process.prepare_process()
     code = 1

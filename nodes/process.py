@@ -80,9 +80,8 @@ def failure_message(error: BaseException) -> str:
 class StopRequest:
     """SIGINT and SIGTERM as a request: while it is entered, the first one is only noted.
 
-    Args:
-        patient: Further signals change nothing (nodes: the launcher kills what does not end). Otherwise the second
-            one raises ``KeyboardInterrupt`` (a person has pressed Ctrl-C twice).
+    Where it is ``patient``, further signals change nothing (nodes: the launcher kills what does not end); else the
+    second one raises ``KeyboardInterrupt`` (a person has pressed Ctrl-C twice).
     """
 
     def __init__(

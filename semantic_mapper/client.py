@@ -44,8 +44,7 @@ class MapClient(Closing):
 
     Args:
         endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
-        timeout_s: How long to wait for an answer before asking again.
-        attempts: How often to ask.
+        timeout_s, attempts: How long to wait for an answer before asking again, and how often to ask.
         identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
     """
 

@@ -71,12 +71,8 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
 class FinetuneRound:
     """A round of learning in a ``thread`` of its own, which rests after each step and each look as its share says.
 
-    Once ``cancelled`` is set it ends after the step that it is in, and nobody wants its outcome any more.
-
-    Args:
-        parent, parent_digest: Weights in use, and the SHA-256 of their file.
-        fraction: Of a core, or of the GPU, in 0..1.
-        idle: Learn only while nobody else wants the processor.
+    Once ``cancelled`` is set it ends after the step that it is in, and nobody wants its outcome any more. ``parent`` is
+    in use; ``fraction`` is of a core, or of the GPU; where ``idle``, it learns only while nobody else wants the core.
     """
 
     def __init__(

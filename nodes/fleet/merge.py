@@ -88,17 +88,11 @@ def merge_maps(
 
 
 def find_maps(arguments: Sequence[str]) -> dict[str, str]:
-    """Paths and URLs of the maps that are meant.
+    """Paths and URLs of the maps that are meant, by the name of the file, of the folder of a ``map.npz``, or of the log
+    that it was made of; by the path or URL itself where two have the same name.
 
-    Raises ConfigError: fewer than two maps, or no such file. StoreError: a store cannot be reached.
-
-    Args:
-        arguments: Paths or URLs of map files, of folders with a ``map.npz``, or of stores: the latest replay of each
-            of its logs.
-
-    Returns:
-        By the name of the file, of the folder of a ``map.npz``, or of the log that it was made of; by the path or URL
-        itself where two have the same name.
+    Arguments are paths or URLs of map files, of folders with a ``map.npz``, or of stores: the latest replay of each of
+    its logs. Raises ConfigError: fewer than two maps, or no such file. StoreError: a store cannot be reached.
     """
     found: list[tuple[str, str]] = []
     for argument in arguments:
@@ -125,8 +119,7 @@ def read_poses(path: Path) -> dict[str, Float64]:
 
     Raises ConfigError: the file cannot be read, or holds something else. PoseError: a matrix is no rigid transform.
 
-    Args:
-        path: JSON, an object whose values are 4 rows of 4 numbers (T_world_map) or [x, y, z, yaw_deg], yaw about +z.
+    The file is JSON, an object whose values are 4 rows of 4 numbers (T_world_map) or [x, y, z, yaw_deg], yaw about +z.
     """
     poses: dict[str, Float64] = {}
     for name, values in read_json(path, dict[str, list[Any]]).items():

@@ -74,8 +74,7 @@ class Tables:
 
         Raises ConfigError: DuckDB refuses it, in its words.
 
-        Args:
-            text: A statement of SQL in DuckDB's dialect, or names of columns of ``logs``, such as ``log, miou``.
+        ``text`` is a statement of SQL in DuckDB's dialect, or names of columns of ``logs``, such as ``log, miou``.
         """
         try:
             found = self._database.execute(text if _SQL.match(text) else f"SELECT {text} FROM logs")

@@ -130,8 +130,7 @@ def make_task(
         operation: Of ``OPERATIONS``.
         out: Path or URL of the store, which is made where nothing is.
         weights: File, URL, or name of weights that ship; None = the default ones.
-        assignments: What ``--set NAME=VALUE`` says, such as ``max_frames=100`` or ``voxel_map.voxel_size_m=0.05``.
-        config: TOML file with the same names; assignments go before it.
+        assignments: As of ``--set``, such as ``max_frames=100``; they go before ``config``, a TOML file of such names.
     """
     found = OPERATIONS[operation]
     given = {} if config is None else read_toml(config)
@@ -164,8 +163,6 @@ def run_fleet(
     Raises FleetError: no node has the resources, or a worker has other code. StoreError: the store cannot be reached.
 
     Args:
-        task: What to do with each log.
-        inputs: The logs.
         cpus, gpus, memory_gb: What Ray reserves for a task.
         stopped: Looked at often; once it is true, tasks that run are ended and the run is over.
         on_progress: Called after each log.

@@ -104,9 +104,7 @@ class Store:
     Raises ConfigError: no store is there, or one of another version. StoreError: it cannot be reached. DependencyError:
     no package for this kind of URL.
 
-    Args:
-        url: Path or URL, such as ``runs/fleet`` or ``s3://bucket/fleet``.
-        create: Make it where nothing is.
+    ``url`` may be a path, such as ``runs/fleet`` or ``s3://bucket/fleet``; ``create`` makes it where nothing is.
     """
 
     def __init__(self, url: str, *, create: bool = False) -> None:
@@ -310,10 +308,6 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
     (relative paths count from the manifest) and any others, which become tags. Whether a log can be read is found out
     by its task. Raises ConfigError: a glob matches nothing, a path is missing, a manifest cannot be used, or there is
     no log at all. StoreError: something cannot be reached.
-
-    Args:
-        arguments: Paths and URLs.
-        suffix: Of files, such as ".mcap".
     """
     found: dict[str, LogInput] = {}
     for argument in arguments:

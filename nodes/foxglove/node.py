@@ -115,12 +115,7 @@ def _hand_on(parts: list[bytes], server: FoxgloveServer, sender: _MapSender, str
 
 
 class _MapSender:
-    """Sends map and graph on whenever they have changed or somebody new receives them.
-
-    Args:
-        client: Of the mapper; one that is restarted is found again.
-        server: Where to.
-    """
+    """Sends map and graph on whenever they have changed or somebody new receives them."""
 
     def __init__(self, client: MapClient, server: FoxgloveServer) -> None:
         self.frames, self.stamp_ns = 0, 0  # heard of, and stamp of the newest one

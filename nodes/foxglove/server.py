@@ -1,9 +1,7 @@
 """A Foxglove websocket on this machine: what a launch publishes, as Foxglove's own message types.
 
 A client that does not keep up loses the oldest of what waits for it. What nobody subscribes to is not even encoded.
-
-Raises:
-    DependencyError: on import, where the extra is not installed.
+On import, raises DependencyError: the extra is not installed.
 """
 
 from __future__ import annotations
@@ -79,23 +77,21 @@ class _Camera:
 class FoxgloveServer:
     """Serves Foxglove; a context manager. Frames and status come from one thread, map and graph from another.
 
-    Raises TransportError: the port is taken.
-
-    Args:
-        port: Of 127.0.0.1; 0 = any that is free.
+    ``port`` 0 = any that is free. Raises TransportError: the port is taken.
     """
 
     def __init__(self, port: int) -> None:
         context = foxglove.Context()
         self._context = context
-        self._listener = _Listener()
+        listener = _Listener()
+        self.requests = listener.requests
         try:
             self._server = foxglove.start_server(
                 name="semantic-mapper",
                 host=HOST,
                 port=port,
                 context=context,
-                server_listener=self._listener,
+                server_listener=listener,
                 message_backlog_size=BACKLOG,
             )
         except RuntimeError as error:
@@ -123,10 +119,6 @@ class FoxgloveServer:
 
     def __exit__(self, *_: object) -> None:
         self._server.stop()
-
-    def requests(self, subject: Subject) -> int:
-        """How many have begun to receive this so far, or 0 where nobody receives it now."""
-        return self._listener.requests(subject)
 
     def send_labels(self, label_set: LabelSet) -> None:
         """The classes of the map, before anything that has classes."""
@@ -214,7 +206,7 @@ class _Listener(foxglove.websocket.ServerListener):
         self._last = 0.0  # when somebody joined
 
     def requests(self, subject: Subject) -> int:
-        """As of the server."""
+        """How many have begun to receive this so far, or 0 where nobody receives it now."""
         with self._lock:
             settled = time.monotonic() - self._last > SETTLE_S
             return self._joined[subject] if self._there[subject] and settled else 0

@@ -72,10 +72,7 @@ class LabelSession:
     its label image is damaged. Labels are class ids of the pixels, row by row, a byte each; the ignore id where nothing
     is labelled.
 
-    Args:
-        log: Open as long as the session.
-        folder: Where label images are read from and written to.
-        order: Numbers of the frames to label, in the order in which the page shows them.
+    ``log`` is open as long as the session; ``order`` has the numbers of the frames to label, as the page shows them.
     """
 
     def __init__(self, log: Log, folder: LabelFolder, order: Sequence[int]) -> None:
@@ -125,10 +122,7 @@ class LabelSession:
         Raises ChangedElsewhereError: somebody else has changed it since. LabelError: not a byte a pixel, or an id that
         is no class. LogError: it cannot be written.
 
-        Args:
-            number: Of the frame.
-            data: The label.
-            revision: ``revision_of`` what the person changed; None = whatever is there is replaced.
+        ``revision`` is ``revision_of`` what the person changed; None = whatever is there is replaced.
         """
         with self._lock:
             height, width = self.size(number)

@@ -116,12 +116,8 @@ def find_launch(path: Path) -> Path:
 def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = None) -> Launch:
     """Read and check a launch file.
 
-    Raises ConfigError: unknown key, name or node (with the nearest valid one), a missing value, or one of a wrong type.
-
-    Args:
-        path: Of the file.
-        settings: "NODE.OPTION=VALUE" or "SETTING=VALUE", see ``_override``.
-        out: The same as "out=DIR".
+    ``settings`` are "NODE.OPTION=VALUE" or "SETTING=VALUE", see ``_override``; ``out`` is the same as "out=DIR". Raises
+    ConfigError: unknown key, name or node (with the nearest valid one), a missing value, or one of a wrong type.
     """
     file = load_config(path, LaunchFile)
     names = [n.name for n in file.node]

@@ -46,7 +46,7 @@ class HeartbeatWriter:
         """Write a heartbeat every ``PERIOD_S`` from a thread."""
         if self._fd < 0:
             return
-        _signal_when_launcher_dies(signal.SIGCONT)  # a stopped process would never learn of it
+        end_with_launcher(signal.SIGCONT)  # a stopped process would never learn of it
         signal.alarm(self._orphan_timeout_s)  # at once: the process may hang before the thread runs
         threading.Thread(target=self._run, name="heartbeat", daemon=True).start()
 
@@ -56,10 +56,7 @@ class HeartbeatWriter:
         self._write(RUNNING)
 
     def turn(self) -> None:
-        """One turn of the main loop. After the first call, more are expected until ``ending``.
-
-        Afterwards: one more step of writing results is done.
-        """
+        """One turn of the main loop; after the first, more are expected until ``ending``. Then: a step of results."""
         now = time.monotonic()
         if now - self._last_turn > PERIOD_S:
             self._last_turn = now
@@ -102,12 +99,8 @@ class HeartbeatWriter:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def end_with_launcher() -> None:
-    """Be killed by the kernel when the parent process dies."""
-    _signal_when_launcher_dies(signal.SIGKILL)
-
-
-def _signal_when_launcher_dies(signum: signal.Signals) -> None:
+def end_with_launcher(signum: signal.Signals = signal.SIGKILL) -> None:
+    """Be sent this signal by the kernel when the parent process dies."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signum)
 
 
@@ -207,11 +200,8 @@ class ProgressLimit:
         self._since = self._cpu_at_mark = self._cpu_at_progress = 0.0
 
     def exceeded(self, mark: object = None) -> bool:
-        """Whether nothing got on for too long; to be called often.
-
-        Args:
-            mark: What the process says of its progress: anything that differs from before where it gets on.
-        """
+        """Whether nothing got on for too long; to be called often. ``mark`` is what the process says of its progress:
+        anything that differs from before where it gets on."""
         now, cpu = self._clock(), self._cpu_s()
         if mark != self._mark:
             self._mark, self._since = mark, now

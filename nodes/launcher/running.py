@@ -102,10 +102,8 @@ def socket_in_launch(place: str, name: str) -> str:
 def map_endpoint(place: str) -> str:
     """Where the mapper answers that a person means by a place; empty for anything else, such as a saved map.
 
-    Raises TransportError: there is no such socket, no launch runs, or several do.
-
-    Args:
-        place: An endpoint, ``live`` for the one launch that runs, or the socket folder of a launch.
+    A place is an endpoint, ``live`` for the one launch that runs, or the socket folder of a launch. Raises
+    TransportError: there is no such socket, no launch runs, or several do.
     """
     if place == LIVE or (Path(place) / STATUS_SOCKET).exists():
         place = socket_in_launch("" if place == LIVE else place, QUERY_SOCKET)

@@ -43,9 +43,7 @@ _log = structlog.get_logger(__name__)
 class WebViewer(ExitStack):
     """A web server with the viewer, and a data server that keeps what browsers are shown; a context manager.
 
-    Args:
-        web_port, data_port: Of these; 0 = any that is free.
-        memory_mb: What the data server may keep for browsers that come later; then the oldest goes.
+    A port 0 = any that is free; ``memory_mb`` is what the data server may keep for browsers that come later.
     """
 
     def __init__(self, web_port: int = WEB_PORT, data_port: int = DATA_PORT, memory_mb: int = 512) -> None:
@@ -154,17 +152,14 @@ def quiet_page(port: int, source: int, allowed: str) -> LocalServer:
     """Serve the pages of another server of this machine with the order to speak to nobody else.
 
     Rerun's viewer reports its use, looks for newer releases and loads a font, whatever its settings. A content security
-    policy is what a browser obeys.
-
-    Args:
-        port: See ``LocalServer``.
-        source: Port of the other server.
-        allowed: Origin that the page may fetch from, in addition to this server.
+    policy is what a browser obeys. ``source`` is the port of the other server, ``allowed`` an origin that the page may
+    fetch from, too.
     """
     policy = (
         "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
         f"connect-src 'self' data: blob: {allowed}; form-action 'none'; base-uri 'self'"
     )
+    headers = {"Content-Security-Policy": policy, "Referrer-Policy": "no-referrer"}
 
     class Handler(BaseHTTPRequestHandler):
         """One request."""
@@ -182,11 +177,7 @@ def quiet_page(port: int, source: int, allowed: str) -> LocalServer:
                     answer = connection.getresponse()
                     kept = {name: answer.headers[name] for name in _KEPT if name in answer.headers}
                     self.send_response(answer.status)
-                    for name, value in {
-                        **kept,
-                        "Content-Security-Policy": policy,
-                        "Referrer-Policy": "no-referrer",
-                    }.items():
+                    for name, value in (kept | headers).items():
                         self.send_header(name, value)
                     self.end_headers()
                     shutil.copyfileobj(answer, self.wfile)

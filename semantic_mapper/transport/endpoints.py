@@ -54,13 +54,10 @@ def default_endpoint(name: str, namespace: str = "default") -> str:
 def check_bind(endpoint: str, keys: Keys | None = None) -> None:
     """Refuse (``TransportError``) to listen where other machines could connect, unless there are keys, and peers to be
     let in; and transports other than ipc, inproc and tcp."""
-    transport, _, address = endpoint.partition("://")
-    if transport not in ("ipc", "inproc", "tcp"):
-        raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
+    transport, address = _split(endpoint)
     if transport == "ipc" and (address[:1] in ("", "@") or len(os.fsencode(address)) > _MAX_IPC_PATH):
         raise TransportError(
-            f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes; use a shorter one (sockets of "
-            "a launch lie in TMPDIR)"
+            f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes (sockets of a launch lie in TMPDIR)"
         )
     if transport != "tcp" or is_loopback(address):
         return
@@ -71,24 +68,27 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
         )
     if not keys.peers():
         raise TransportError(
-            f"{endpoint}: nobody could connect, as {keys.folder} has no peers; add their public keys with "
-            "`semantic-mapper keys allow NAME KEY`"
+            f"{endpoint}: nobody could connect, as {keys.folder} has no peers; `semantic-mapper keys allow NAME KEY`"
         )
 
 
 def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None:
     """Refuse (``TransportError``) to take the word of another machine, unless it is known by its key; and transports
     other than ipc, inproc and tcp."""
-    transport, _, address = endpoint.partition("://")
-    if transport not in ("ipc", "inproc", "tcp"):
-        raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
+    transport, address = _split(endpoint)
     if transport == "tcp" and identity is None and not is_loopback(address):
         raise TransportError(
             f"{endpoint}: is on another machine, and without keys anybody in the network could answer in its place. "
-            "Make keys on both sides and tell each the other's (`semantic-mapper keys make`, `keys allow NAME KEY`), "
-            "then name that machine (--server NAME, or the option `server`); or tunnel it (ssh -L) and connect to "
-            "tcp://127.0.0.1:PORT"
+            "Make keys on both sides (`semantic-mapper keys make`, `keys allow NAME KEY`) and name that machine "
+            "(--server NAME, or the option `server`); or tunnel it (ssh -L) and connect to tcp://127.0.0.1:PORT"
         )
+
+
+def _split(endpoint: str) -> tuple[str, str]:
+    transport, _, address = endpoint.partition("://")
+    if transport not in ("ipc", "inproc", "tcp"):
+        raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
+    return transport, address
 
 
 def is_loopback(address: str) -> bool:
@@ -119,14 +119,9 @@ class Closing:
 class ServerSocket(Closing):
     """A bound socket (``socket``), and its ``endpoint`` as ZeroMQ names it.
 
-    The file of an ``ipc://`` socket is this user's alone from the start (mode 0600). Raises TransportError: the
-    endpoint is taken, cannot be bound, or could be reached from other machines and there are no keys.
-
-    Args:
-        kind: Of ZeroMQ's.
-        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one).
-        keys: Encrypt, and let in only their peers; needed where other machines could connect.
-        options: Of the socket.
+    The file of an ``ipc://`` socket is this user's alone from the start (mode 0600); of ``tcp://ADDRESS:PORT`` the port
+    ``*`` is any free one. With ``keys`` all is encrypted, and only their peers are let in; needed where other machines
+    could connect. Raises TransportError: the endpoint is taken, cannot be bound, or lacks keys.
     """
 
     def __init__(

@@ -101,9 +101,7 @@ def allow(folder: Path, name: str, public: str) -> None:
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,47}", name):
         raise TransportError(f"'{name}' cannot name a peer: use letters, digits and any of _ . -")
     if not _is_key(public.encode()):
-        raise TransportError(
-            f"'{public}' is no public key of {_KEY_LETTERS} letters; `semantic-mapper keys show` has it"
-        )
+        raise TransportError(f"'{public}' is no public key; `semantic-mapper keys show` has it")
     path = folder / _PEERS / f"{name}.key"
     certificate = f'metadata\n    name = {name}\ncurve\n    public-key = "{public}"\n'
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -141,10 +139,8 @@ def secure_client(socket: zmq.Socket[bytes], identity: ServerIdentity) -> None:
     peers = identity.keys.peers()
     known = {"": identity.keys.public, **peers}
     if identity.server not in known:
-        raise TransportError(
-            f"{identity.keys.folder}: no peer '{identity.server}'; there are: {', '.join(peers) or 'none'}. Add the "
-            "server's public key with `semantic-mapper keys allow NAME KEY`"
-        )
+        there = f"there are: {', '.join(peers) or 'none'}; `semantic-mapper keys allow NAME KEY` adds one"
+        raise TransportError(f"{identity.keys.folder}: no peer '{identity.server}'; {there}")
     socket.setsockopt(zmq.CURVE_SERVERKEY, known[identity.server])
     socket.setsockopt(zmq.CURVE_PUBLICKEY, identity.keys.public)
     socket.setsockopt(zmq.CURVE_SECRETKEY, identity.keys.secret)

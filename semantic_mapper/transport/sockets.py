@@ -93,11 +93,10 @@ class Publisher(Closing):
     Raises TransportError: see ``ServerSocket``.
 
     Args:
-        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
+        endpoint, keys: As of ``ServerSocket``.
         policy: Toward a subscriber that does not keep up. "drop" (live): it loses messages. "block" (replay,
             recording): ``publish`` waits for it, so that nothing is lost.
         hwm: Messages that may wait for each subscriber.
-        keys: Encrypt, and let in only their peers; needed where other machines could connect.
         linger_ms: How long ``close`` waits for the last messages to be delivered.
     """
 
@@ -491,8 +490,7 @@ class _Connections:
 class QueryServer(ServerSocket):
     """Binds an endpoint, receives questions and sends answers. One thread uses it; any thread may ``wake`` that one.
 
-    A client that does not take its answers loses them; nothing here ever waits for a client. Arguments and errors as
-    of ``ServerSocket``.
+    A client that does not take its answers loses them; nothing here ever waits for a client. Errors: ``ServerSocket``.
     """
 
     def __init__(self, endpoint: str, *, keys: Keys | None = None) -> None:
@@ -541,13 +539,8 @@ class QuerySocket(Closing):
 
     Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
     server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
-    does carries an id, and a server that has seen it only answers. Raises TransportError: see ``client_socket``.
-
-    Args:
-        endpoint: Where the server listens.
-        timeout_s: How long to wait for an answer each time.
-        attempts: How often to ask.
-        identity: Of a server that has keys.
+    does carries an id, and a server that has seen it only answers. It is asked ``attempts`` times and given
+    ``timeout_s`` for each answer. Raises TransportError: see ``client_socket``.
     """
 
     def __init__(
