@@ -12,6 +12,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.drivers.base import CorrectedWorld
 from semantic_mapper.errors import SemanticMapperError, TransportError
 from semantic_mapper.nodes.options import LiveCamera, table_of
+from semantic_mapper.nodes.publishing import PartStatus
 
 RETRY_S = 2.0
 LAST_S = 10.0  # how long the last correction may take to reach the mapper, once the stream has ended
@@ -48,15 +49,9 @@ class CorrectionSender:
         self._trouble = ""
         self._thread = threading.Thread(target=self._run, name="corrections", daemon=True)
 
-    @property
-    def counters(self) -> dict[str, int]:
+    def status(self) -> PartStatus:
         """For the status of the camera."""
-        return {"corrections_sent": self._sent}
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Why the map does not follow closed loops."""
-        return (self._trouble,) if self._trouble else ()
+        return PartStatus({"corrections_sent": self._sent}, (self._trouble,))
 
     def __enter__(self) -> Self:
         self._thread.start()

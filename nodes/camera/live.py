@@ -237,15 +237,15 @@ class _LiveNode:
 
     def _warnings(self) -> tuple[str, ...]:
         own = self._source.warnings if self._source is not None else (self._waiting_for,)
-        sender = () if self.sender is None else self.sender.warnings
+        sender = () if self.sender is None else self.sender.status().warnings
         return tuple(text for text in (*own, *sender, self._note) if text)
 
     def _report(self, state: NodeState) -> None:
         counters = {"published": self._published}
         if self._first_seq >= 0:
             counters["missing"] = self._last_seq - self._first_seq + 1 - self._published
-        for part in (self._source, self.sender):
-            counters |= {} if part is None else part.counters
+        counters |= {} if self._source is None else self._source.counters
+        counters |= {} if self.sender is None else self.sender.status().counters
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
             self._status.publish(state, PartStatus(counters, self._warnings(), ages), timeout_s=0.0)

@@ -59,11 +59,7 @@ def finetune(
         (from_scratch and (weights or kind), "--from-scratch", "leave out --weights and --kind"),
         ((boxes is not None) != (kind == "panoptic"), "--boxes", "--kind panoptic and --boxes FILE go together"),
         (pseudo is not None and kind != "panoptic", "--pseudo", "goes with --kind panoptic only"),
-        (
-            without_labels and (labels is not None or keyframes is not None or strokes),
-            "--kind",
-            f"{kind} learns from no keyframes and strokes",
-        ),
+        (without_labels and (labels or keyframes or strokes), "--kind", f"{kind} learns from no keyframes and strokes"),
         (not without_labels and labels is None and keyframes is None, "--keyframes", "how many labelled frames?"),
     )
     must_be_there(log)

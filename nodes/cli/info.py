@@ -147,12 +147,8 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
     counts = [f"{note['labelled']} of {frames} labelled"]
     for key, text in (("labelled_pixels", "of the pixels"), ("mean_confidence", "mean confidence")):
         counts += [f"{text} {note[key] * 100:.1f} %"] if note[key] is not None else []
-    for key, text in (
-        ("kept", "labels kept"),
-        ("replaced", "labels replaced"),
-        ("unlabelled", "left without a label"),
-        ("depth_written", "depth images computed"),
-    ):
+    texts = {"kept": "labels kept", "replaced": "labels replaced", "unlabelled": "left without a label"}
+    for key, text in (texts | {"depth_written": "depth images computed"}).items():
         counts += [f"{note[key]} {text}"] if note[key] else []
     return [("pseudo labels by", by), ("pseudo labels", "; ".join(counts))]
 
@@ -238,22 +234,15 @@ def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, An
         state = client.weights()
     rows = [
         (
-            v.version,
-            v.state,
-            v.keyframes or "",
-            f"{v.score * 100:.1f} %" if v.version else "",
-            f"{v.parent_score * 100:.1f} %" if v.version else "",
-            v.digest[:12],
-            v.reason,
+            *(v.version, v.state, v.keyframes or ""),
+            *(f"{score * 100:.1f} %" if v.version else "" for score in (v.score, v.parent_score)),
+            *(v.digest[:12], v.reason),
         )
         for v in state.versions
     ]
     names = ("version", "state", "keyframes", "mIoU held out", "of those before", "file", "reason")
-    title = (
-        f"weights {state.in_use} in use; {counted(state.taken, 'time')} taken, {state.refused} refused, "
-        f"{state.rolled_back} rolled back"
-    )
-    output.print(table(rows, names, title=title))
+    counts = f"{counted(state.taken, 'time')} taken, {state.refused} refused, {state.rolled_back} rolled back"
+    output.print(table(rows, names, title=f"weights {state.in_use} in use; {counts}"))
     return to_builtins(state)
 
 
@@ -262,7 +251,17 @@ def _boxes_info(output: Output, file: Path, picture: Path | None, out: Path | No
     boxes = load_boxes(file)
     found = _describe_boxes(boxes)
     if picture is None or out is None:
-        output.print(_box_table(str(file), found))
+        rows = [
+            (
+                *(box["id"], box["class"], box["shape"], "yes" if box["thing"] else "no"),
+                *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
+                len(box["stamps_ns"]) or len(box["frames"]) or "always",
+            )
+            for box in found["boxes"]
+        ]
+        caption = f"left out: {found['left_out']} of no class" if found["left_out"] else ""
+        names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
+        output.print(table(rows, names, title=str(file), caption=caption))
         return found
     refuse_overwriting(out, file, picture)
     prepare_file(out)
@@ -293,20 +292,3 @@ def _describe_boxes(found: BoxFile) -> dict[str, Any]:
     ]
     merge = {name: list(rest) for name, rest in found.merge.items()}
     return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": list(found.bad)}
-
-
-def _box_table(title: str, found: dict[str, Any]) -> Table:
-    rows = [
-        (
-            box["id"],
-            box["class"],
-            box["shape"],
-            "yes" if box["thing"] else "no",
-            *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
-            len(box["stamps_ns"]) or len(box["frames"]) or "always",
-        )
-        for box in found["boxes"]
-    ]
-    caption = f"left out: {found['left_out']} of no class" if found["left_out"] else ""
-    names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
-    return table(rows, names, title=title, caption=caption)

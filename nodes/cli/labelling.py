@@ -72,16 +72,11 @@ def suggest_for_log(
     labelled = {i for i, c in enumerate(candidates) if read[i][0] in painted or c.stamp_ns in stamps}
     if len(own) < len(candidates):
         labelled |= own
-    frames = [
-        {
-            "number": read[s.index][0],
-            "seq": read[s.index][1],
-            "stamp_ns": candidates[s.index].stamp_ns,
-            "gain": s.gain,
-            "shown": s.shown,
-        }
-        for s in suggest_frames(candidates, count, labelled)
-    ]
+    frames: list[dict[str, Any]] = []
+    for s in suggest_frames(candidates, count, labelled):
+        number, seq = read[s.index]
+        stamp_ns = candidates[s.index].stamp_ns
+        frames.append({"number": number, "seq": seq, "stamp_ns": stamp_ns, "gain": s.gain, "shown": s.shown})
     return Suggested(frames, sorted(read[i][0] for i in labelled))
 
 

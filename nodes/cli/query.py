@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.table import Table
 
-from semantic_mapper.client import Correction, MapClient
+from semantic_mapper.client import MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import write_json
@@ -187,24 +187,18 @@ def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
     with MapClient(endpoint, identity=remote.identity()) as client:
         begun = client.correct_poses(poses, until_ns=ALWAYS, within_ns=MATCH_NS)
-        state = _follow(client)
+        with frame_progress("correct", None) as bar:
+            state = client.correction()
+            bar.start(state.total)
+            while state.running:
+                bar.set(state.done, f"of {state.total}")  # frames that come meanwhile are added
+                time.sleep(POLL_S)
+                state = client.correction()
     outcome = f"were given up, the map is as it was: {state.failure}" if state.failure else "are in the map"
     left_out = f"; {begun.left_out} have no frame in the history and were left out" if begun.left_out else ""
     output.print(f"{begun.used} corrected poses {outcome}{left_out}")
     output.json({**asdict(state), "used": begun.used, "left_out": begun.left_out})
     return EXIT_FAILED if state.failure else 0
-
-
-def _follow(client: MapClient) -> Correction:
-    """Wait until no correction is under way."""
-    with frame_progress("correct", None) as bar:
-        state = client.correction()
-        bar.start(state.total)
-        while state.running:
-            bar.set(state.done, f"of {state.total}")  # frames that come meanwhile are added
-            time.sleep(POLL_S)
-            state = client.correction()
-    return state
 
 
 def _relocalize(output: Output, source: str, endpoint: str, log: Path, every: int) -> dict[str, Any]:
@@ -245,7 +239,9 @@ def answer_table(found: dict[str, Any]) -> Table:
     if found["question"] == "graph":
         return _graph_table(found)
     unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
-    rows = [(key.replace("_", " "), _text(value, unit)) for key, value in found.items() if not isinstance(value, dict)]
+    plain = {key: value for key, value in found.items() if not isinstance(value, dict)}
+    plain |= {key: f"{_joined(value)} {unit}" for key, value in plain.items() if isinstance(value, list)}
+    rows = [(key.replace("_", " "), "none" if value is None else str(value)) for key, value in plain.items()]
     classes = sorted(found.get("classes", {}).items(), key=lambda item: -item[1])
     rows += [(name, counted(count, "surface voxel")) for name, count in classes if count]
     return table(rows, title=found["map"])
@@ -255,13 +251,8 @@ def _instance_table(found: dict[str, Any]) -> Table:
     things = [*found["instances"], *found.get("gone", ())]
     rows = [
         (
-            thing["id"],
-            thing["class"],
-            f"{thing['confidence']:.2f}",
-            thing["voxels"],
-            f"{thing['measured'] * 100:.0f} %",
-            _joined(thing["centroid"]),
-            _joined(thing["box"]["size"]),
+            *(thing["id"], thing["class"], f"{thing['confidence']:.2f}", thing["voxels"]),
+            *(f"{thing['measured'] * 100:.0f} %", _joined(thing["centroid"]), _joined(thing["box"]["size"])),
             f"{thing['gone_ns'] / 1e9:.2f}" if "gone_ns" in thing else "",
         )
         for thing in things
@@ -280,12 +271,6 @@ def _graph_table(found: dict[str, Any]) -> Table:
         rows.append((room["id"], room["floor"], f"{room['area_m2']:.1f}", doors, objects))
     names = ("room", "floor", "area, m2", "doors to", "objects")
     return table(rows, names, title=found["map"], caption="" if found["floors"] else map_answers.NO_FLOOR)
-
-
-def _text(value: Any, unit: str) -> str:
-    if isinstance(value, list):
-        return f"{_joined(value)} {unit}"
-    return "none" if value is None else str(value)
 
 
 def _joined(xyz: list[float]) -> str:

@@ -337,10 +337,8 @@ class Finetuner:
         counters |= {"learning": int(running is not None), "step": 0 if running is None else running.step}
         warnings = [f"the last weights were refused: {self._refusal}"] if self._refusal else []
         if self._failure:
-            wait_s = max(0.0, self._retry_at_s - time.monotonic())
-            warnings.append(
-                f"the last round failed ({self._failure}); its keyframes are kept, next try in {wait_s:.0f} s"
-            )
+            wait = f"next try in {max(0.0, self._retry_at_s - time.monotonic()):.0f} s"
+            warnings.append(f"the last round failed ({self._failure}); its keyframes are kept, {wait}")
         if self._store_failure:
             warnings.append(f"keyframes would be lost with this process: {self._store_failure}")
         if self._in_use is not None and self._current is None:

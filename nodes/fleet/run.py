@@ -199,8 +199,8 @@ def run_fleet(
             key, error = task.key(log.url), _count(reference, report)
             if error:
                 error = without_secrets(" ".join(error.split()))[:_MAX_ERROR]
-                shown, version = without_secrets(log.url), code_version()
-                about = {"operation": task.operation, "tags": log.tags, "version": version}
+                shown = without_secrets(log.url)
+                about = {"operation": task.operation, "tags": log.tags, "version": code_version()}
                 failure = Failure(key=key, log=shown, error=error, finished_ns=time.time_ns(), **about)
                 _log.error("log_failed", log=shown, error=error)
                 store.note_failure(failure)
@@ -265,9 +265,7 @@ def run_task(task: Task, log: LogInput) -> bool:
     try:
         store = Store(task.store)
     except ConfigError as error:
-        raise StoreError(
-            f"{socket.gethostname()}: {error}. Where nodes share no folder of this name, --out must be a bucket"
-        ) from error
+        raise StoreError(f"{socket.gethostname()}: {error}. Where nodes share no folder, --out is a bucket") from error
     versions = _versions(log.url)
     source = f"sources/{_digest(log.url, *versions.values())}"
     known = store.find(source) if all(versions.values()) else None  # the log was read before
@@ -426,12 +424,9 @@ def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -
     events = [("note", text) for text in notes(summary)]
     events += [("damaged", text) for text in summary["damaged_stretches"]]
     events += [("refused", f"frame {r['seq']}: {r['reason']}") for r in summary["refusals"]]
-    return Findings(
-        metrics=metrics,
-        costs={**costs, "map_memory_mb": summary["map"]["memory_mb"]},
-        scores=(_scores("replay", dig(summary, "metrics.per_class") or {}, session.segments),),
-        events=tuple(events[:_MAX_EVENTS]),
-    )
+    costs["map_memory_mb"] = summary["map"]["memory_mb"]
+    scores = _scores("replay", dig(summary, "metrics.per_class") or {}, session.segments)
+    return Findings(metrics=metrics, costs=costs, scores=(scores,), events=tuple(events[:_MAX_EVENTS]))
 
 
 def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
@@ -445,31 +440,19 @@ def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> 
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
     metrics |= {f"miou {method}": figures.get("miou") for method, figures in methods.items()}
     metrics |= {f"frames_{key}": scores[key] for key in ("scored", "excluded", "refused", "damaged", "pseudo_labelled")}
-    return Findings(
-        metrics=metrics,
-        scores=tuple(_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items()),
-    )
+    scored = (_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items())
+    return Findings(metrics=metrics, scores=tuple(scored))
 
 
 def _autolabel(log: Path, out: Path, weights: Path | None, settings: AutolabelSettings) -> Findings:
-    request = AutolabelRequest(
-        (log,),
-        out / "labelled.mcap",
-        weights,
-        _part(settings, MapperConfig),
-        settings.write_depth,
-        settings.min_confidence,
-        settings.overwrite_labels,
-        settings.max_frames,
-    )
-    report = autolabel_log(request)
+    which = (settings.write_depth, settings.min_confidence, settings.overwrite_labels, settings.max_frames)
+    config = _part(settings, MapperConfig)
+    report = autolabel_log(AutolabelRequest((log,), out / "labelled.mcap", weights, config, *which))
     figures = ("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written", "mean_confidence")
     events = [("unlabelled", text) for text in report.unlabelled]
     events += [("damaged", text) for text in report.damage]
-    return Findings(
-        metrics={name: getattr(report.note, name) for name in (*figures, "labelled_pixels")},
-        events=tuple(events[:_MAX_EVENTS]),
-    )
+    metrics = {name: getattr(report.note, name) for name in (*figures, "labelled_pixels")}
+    return Findings(metrics=metrics, events=tuple(events[:_MAX_EVENTS]))
 
 
 def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSettings) -> Findings:
@@ -485,11 +468,9 @@ def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSett
     checkpoint, chosen = finetune_log(request)
     recipe = checkpoint.recipe
     names = ("steps", "best_step", "held_out_loss", "held_out_accuracy", "psnr")
-    return Findings(
-        metrics={name: recipe[name] for name in names if name in recipe},
-        costs={"fit_s": recipe.get("seconds")},
-        events=(("keyframes", ", ".join(map(str, chosen))),),
-    )
+    metrics = {name: recipe[name] for name in names if name in recipe}
+    events = (("keyframes", ", ".join(map(str, chosen))),)
+    return Findings(metrics=metrics, costs={"fit_s": recipe.get("seconds")}, events=events)
 
 
 def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import cv2
 import msgspec
@@ -24,6 +24,7 @@ from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.base import CameraPath, quaternion
+from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame, UInt8
 
@@ -74,7 +75,7 @@ class _Camera:
         self.path = CameraPath()
 
 
-class FoxgloveServer:
+class FoxgloveServer(Closing):
     """Serves Foxglove; a context manager. Frames and status come from one thread, map and graph from another.
 
     ``port`` 0 = any that is free. Raises TransportError: the port is taken.
@@ -114,10 +115,8 @@ class FoxgloveServer:
         """What a client connects to."""
         return f"ws://{HOST}:{self._server.port}"
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Serve nobody any more."""
         self._server.stop()
 
     def send_labels(self, label_set: LabelSet) -> None:

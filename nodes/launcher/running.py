@@ -60,9 +60,7 @@ def read_launch_note(folder: Path) -> LaunchNote:
     try:
         return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
     except (OSError, msgspec.DecodeError) as error:
-        raise TransportError(
-            f"{folder / NOTE}: no note of a launch of this version of the package: {error}; `up` names its folder"
-        ) from error
+        raise TransportError(f"{folder / NOTE}: no note of a launch: {error}; `up` names its folder") from error
 
 
 def running_launches() -> list[Path]:
@@ -128,21 +126,15 @@ def node_endpoints(folder: Path) -> dict[str, str]:
             if isinstance(message, Status):
                 known[message.node] = message
             if time.monotonic() > deadline:
-                raise TransportError(
-                    f"{status}: its nodes have not all come to run for {START_S:g} s; see `view --status`"
-                )
-    return {
-        name: f"ipc://{folder}/{name}"
-        for name, node in sorted(known.items())
-        if node.state != "ended" and name != STATUS_SOCKET
-    }
+                raise TransportError(f"{status}: not all nodes have come to run in {START_S:g} s; see `view --status`")
+    running = sorted(name for name, node in known.items() if node.state != "ended" and name != STATUS_SOCKET)
+    return {name: f"ipc://{folder}/{name}" for name in running}
 
 
 def _all_ready(known: Mapping[str, Status]) -> bool:
     launch = known.get(STATUS_SOCKET)
-    if launch is None or len(known) - 1 < launch.counters["nodes"]:
-        return False
-    return all(status.state != "starting" for status in known.values())
+    counted = launch is not None and len(known) > launch.counters["nodes"]
+    return counted and all(status.state != "starting" for status in known.values())
 
 
 class LaunchView:

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import structlog
 
@@ -23,6 +23,7 @@ from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries.questions import Weights, WeightsEntry
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
@@ -47,7 +48,7 @@ class _Task:
     trial: FieldTrial | None = None
 
 
-class LiveWeights:
+class LiveWeights(Closing):
     """Takes, refuses and lists weights, goes back to earlier ones, and publishes which are in use. A context manager.
 
     ``bundle`` is what the mapper was started with.
@@ -79,11 +80,9 @@ class LiveWeights:
         reason = self._answer.get("reason")
         return PartStatus(counters, (f"weights {self._answer['judged']} were refused: {reason}" if reason else "",))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def close(self) -> None:
+        """End, and receive no more offers."""
+        self.end()
         self._offers.close()
 
     def advance(self, session: MapSession | None, *, mapped: bool) -> None:
@@ -150,7 +149,7 @@ class LiveWeights:
                 self._requested = number
         return self.describe()
 
-    def close(self) -> Weights:
+    def end(self) -> Weights:
         """End the thread; unfinished weights are refused. Returns what became of all. Harmless when repeated."""
         self._end_task("the mapper ends")
         self._reader.shutdown(wait=True, cancel_futures=True)
@@ -174,11 +173,10 @@ class LiveWeights:
             return
         agreement = task.trial.agreement
         if agreement is not None and agreement < self._least_agreement:
-            reason = (
-                f"where the map is sure of itself, they agree with {agreement:.2f} of it; at least "
-                f"{self._least_agreement:g} is required (min_map_agreement)"
+            least = f"at least {self._least_agreement:g} is required (min_map_agreement)"
+            self._end_task(
+                f"where the map is sure of itself, they agree with {agreement:.2f}; {least}", contradicts=True
             )
-            self._end_task(reason, contradicts=True)
             return
         task.trial.exchange()
         number, before = task.version.version, self._in_use

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Self
 
 import structlog
 from msgspec import to_builtins
@@ -30,6 +29,7 @@ from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
 from semantic_mapper.replay.session import MapSession, Refusal
 from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import load_keys
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, NodeState, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
@@ -59,7 +59,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         mapper.finish()
 
 
-class MapperNode:
+class MapperNode(Closing):
     """A mapper from its first message to its last file. A context manager."""
 
     def __init__(self, context: NodeContext, options: MapperOptions) -> None:
@@ -102,10 +102,8 @@ class MapperNode:
             self._resources = stack.pop_all()
         _log.info("ready", weights=self._bundle.weights_path.name, input=options.cameras, delivery=options.delivery)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Free its sockets and threads."""
         self._resources.close()
 
     def run(self) -> None:
@@ -226,7 +224,7 @@ class MapperNode:
         if self._queries is not None:
             self._queries.hand_over()  # questions are answered while the map is written
         if self._weights is not None:
-            self._session.learned = to_builtins(self._weights.close())
+            self._session.learned = to_builtins(self._weights.end())
         summary = finish_session(self._session, self._out, self._ended_by, self._resumed, self._step_of_finish)
         _log.info("map_written", out=str(self._out), **summary["frames"])
         self._publish_status("ended", now=True)

@@ -131,22 +131,17 @@ class Recorder:
         self._recorded: set[bytes] = set()  # what the recording holds of streams
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 
-    @property
-    def log_bytes(self) -> int:
-        """Of all parts that are on the disk by now."""
-        size = 0
-        for file in parts_on_disk(self._path).values():
-            with suppress(FileNotFoundError):  # somebody has just deleted it
-                size += file.stat().st_size
-        return size
-
     def status(self) -> PartStatus:
         """For the node's status."""
         counters = {"missed": self.missing_frames.missed, "rejected": self.rejected}
         if (r := self.recording) is None:
             return PartStatus(counters)
         counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost}
-        counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": self.log_bytes // 1024}
+        size = 0
+        for file in parts_on_disk(self._path).values():
+            with suppress(FileNotFoundError):  # somebody has just deleted it
+                size += file.stat().st_size
+        counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": size // 1024}
         return PartStatus(counters, (r.trouble,))
 
     @property
