@@ -206,13 +206,12 @@ def read_costs(path: Path, label_set: LabelSet) -> NDArray[np.int64]:
     costs = np.full(256, -1, np.int64)
     given = read_toml(path)
     if not given:
-        raise ConfigError(f"{path}: has no costs; write lines CLASS = COST, from 0 to 100, of {', '.join(sorted(ids))}")
+        raise ConfigError(f"{path}: has no costs; write lines CLASS = COST, from 0 to 100")
     for name, value in given.items():
-        if name not in ids:
-            raise ConfigError(f"{path}: '{name}' is no class of the map; it has {', '.join(sorted(ids))}")
-        if type(value) is not int or not 0 <= value <= OCCUPIED:
+        if name not in ids or type(value) is not int or not 0 <= value <= OCCUPIED:
             raise ConfigError(
-                f"{path}: {name} = {value!r}: a cost is a whole number from 0, free, to 100, no way through"
+                f"{path}: {name} = {value!r}: a cost is a whole number from 0, free, to 100, no way through, of one of "
+                f"the classes {', '.join(sorted(ids))}"
             )
         costs[ids[name]] = value
     return costs

@@ -86,13 +86,7 @@ def recording_server(url: str) -> rr.RecordingStream:
 
 
 class RerunLog:
-    """Writes to one recording. Frames and maps may come from two threads.
-
-    Args:
-        stream: From ``recording_file`` or ``recording_server``.
-        label_set: Of rendered images and map.
-        voxel_size_m: Of the map.
-    """
+    """Writes to one recording. Frames and maps may come from two threads; ``label_set`` is that of images and map."""
 
     def __init__(self, stream: rr.RecordingStream, label_set: LabelSet, voxel_size_m: float = 0.02) -> None:
         self._stream = stream
@@ -193,9 +187,7 @@ class RerunLog:
     def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = ()) -> None:
         """Rooms, doors and things of the map as it is now, in the view that is coloured by class.
 
-        Args:
-            graph: Of the map.
-            gone: Things that have left; where they were is drawn in grey, with the stamp of when they went.
+        Where things were that are ``gone`` is drawn in grey, with the stamp of when they went.
         """
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
         names = [f"room {room.id}, {room.area_m2:.1f} m²" for room in graph.rooms]
@@ -342,12 +334,8 @@ class Eye(NamedTuple):
 
 
 def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
-    """An eye on a map from its most open side: from above, or, of a room with a ceiling, from inside, out of a corner.
-
-    Args:
-        xyz: (N, 3) points of the map, N > 0.
-        up: (3,) first guess of which way is up; None = unknown.
-    """
+    """An eye on a map, points (N, 3), N > 0, from its most open side: from above, or, of a room with a ceiling, from
+    inside, out of a corner. ``up`` (3,) is a first guess of which way is up; None = unknown."""
     R_upright_world = upright_rotation(xyz, up)
     upright = xyz.astype(np.float64) @ R_upright_world.T
     low, high = np.percentile(upright, (1, 99), axis=0)
@@ -401,16 +389,11 @@ def camera_path(camera: str) -> str:
 def layout(cameras: Sequence[str], colourings: Sequence[str], eye: Eye | None) -> rrb.Blueprint:
     """The map in one tab a colouring, the legend next to it, the images of each camera, and the times of all stages.
 
-    Args:
-        cameras: Their names; none for a map alone.
-        colourings: Of the map.
-        eye: From where to look at the map first; None = there is no map yet.
+    Without ``cameras`` it is a map alone; without an ``eye``, from where to look at it first, there is no map yet.
     """
     seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb", "moving")]
     seen = [line.rstrip("/") for line in seen] + ["+ /world/path/**"]
-    eyes = None
-    if eye is not None:
-        eyes = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
+    eyes = eye and rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
     maps = [
         rrb.Spatial3DView(
             origin="/world",

@@ -84,7 +84,6 @@ class LogWriter:
         path: Of the new file.
         info: What the stream is.
         options: How ``write_frame`` packs; lossless by default.
-        overwrite: Whether an existing file may be replaced.
         attachments: What else to keep in it.
         named: How errors call the file, where it has another name until it is whole.
     """
@@ -253,11 +252,7 @@ def atomic_log(
 ) -> Iterator[LogWriter]:
     """A writer of the log ``path``, which gets its name as the last thing; after an error no log is left.
 
-    Raises LogError: ``path`` is there already, or cannot be written.
-
-    Args:
-        path, info, options, attachments: See ``LogWriter``.
-        overwrite: Whether a log that is there may be replaced; it stays until then.
+    A log that may be replaced stays until then. Raises LogError: ``path`` is there already, or cannot be written.
     """
     if path.exists() and not overwrite:
         raise LogError(f"{path}: exists already; remove it or choose another name")

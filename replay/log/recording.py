@@ -264,19 +264,12 @@ def _size(parts: Parts) -> int:
 def make_way(path: Path, *, overwrite: bool, dry: bool = False) -> None:
     """Make sure that no other recording is mixed with a new one.
 
-    Raises LogError: something is there, and must not be replaced.
-
-    Args:
-        path: Of its first part.
-        overwrite: Delete what is there.
-        dry: Delete nothing yet.
+    What is there is deleted with ``overwrite``, not yet if ``dry``. Raises LogError: it must not be replaced.
     """
     for file in parts_on_disk(path).values():  # parts also come of a recorder that was restarted
         if not overwrite:
-            raise LogError(
-                f"{file}: exists already; give another name, or let it be replaced: --overwrite, in a launch file "
-                "overwrite = true"
-            )
+            how = "let it be replaced: --overwrite, in a launch file overwrite = true"
+            raise LogError(f"{file}: exists already; give another name, or {how}")
         if not file.is_file():
             raise LogError(f"{file}: is no file that a log could replace; give another name")
         if not dry:

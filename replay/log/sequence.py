@@ -22,7 +22,7 @@ def open_log(
 ) -> LogReader:
     """Open a log, or the parts of a recording as one.
 
-    Raises LogError: see ``LogReader``.
+    Raises LogError: see ``LogReader``; or a folder without logs.
 
     Args:
         paths: A file (that log alone), several (the parts of one recording, in any order), or a folder: all logs in it.
@@ -30,7 +30,11 @@ def open_log(
         allow_empty: Open one without frames too.
     """
     named = [Path(paths)] if isinstance(paths, str | Path) else list(paths)
-    files = [file for path in named for file in (logs_in(path) if path.is_dir() else [path])]
+    files: list[Path] = []
+    for path in named:
+        files += sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+    if not files:
+        raise LogError(f"{named[0]}: cannot be read as a recording: the folder holds no log (*{SUFFIX})")
     try:
         return LogReader(files, on_error=on_error, allow_empty=allow_empty)
     except LogError as error:
@@ -41,14 +45,6 @@ def open_log(
             f"{named[0]}: a folder is taken for the parts of one recording, which its logs are not: {error}. To read "
             f"one of them, name its file: {names}"
         ) from error
-
-
-def logs_in(folder: Path) -> list[Path]:
-    """The logs in a folder. Raises LogError: there is no log."""
-    files = sorted(folder.glob(f"*{SUFFIX}"))
-    if not files:
-        raise LogError(f"{folder}: cannot be read as a recording: the folder holds no log (*{SUFFIX})")
-    return files
 
 
 def part_path(first: Path, part: int) -> Path:

@@ -98,13 +98,8 @@ def test_a_log_without_metres_stays_one(tmp_path: Path) -> None:
 def test_what_a_sequence_folder_cannot_hold_is_told(tmp_path: Path) -> None:
     odd = np.full((18, 24), 1.00026, np.float32)
     other = dataclasses.replace(samples.INTRINSICS, fx=99.0)
-    frames = [
-        turned(0),
-        turned(1, depth_m=None),
-        turned(2, depth_m=odd),
-        turned(3, stamp_ns=5),
-        turned(4, intrinsics=other),
-    ]
+    frames = [turned(0), turned(1, depth_m=None), turned(2, depth_m=odd), turned(3, stamp_ns=5)]
+    frames.append(turned(4, intrinsics=other))
     report = exported(write_log(tmp_path / "log.mcap", frames), tmp_path / "sequence")
     assert report.frames == 3
     assert "seq=3" in report.left_out[0] and "not later" in report.left_out[0]
@@ -134,62 +129,42 @@ def test_tum_sequence_and_trajectory(log: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(rows[i, :3], a.T_world_camera[:3, 3], rtol=0)
 
 
-def test_foxglove_file_is_what_the_schemas_say(tmp_path: Path) -> None:
+def test_foxglove_file_is_what_the_schemas_say_and_sends_its_reader_to_the_log(tmp_path: Path) -> None:
     odd = np.full((18, 24), 1.00026, np.float32)
     frames = [turned(0), turned(1, camera_id="left"), turned(2, depth_m=odd, label=None), turned(3, depth_m=None)]
-    log = write_log(tmp_path / "log.mcap", frames)
-    assert exported(log, tmp_path / "foxglove.mcap").frames == 4
-    with (tmp_path / "foxglove.mcap").open("rb") as file:
-        reader = mcap.reader.make_reader(file, validate_crcs=True)
-        found = [(s, c, m.log_time, json.loads(m.data)) for s, c, m in reader.iter_messages()]
-        summary = reader.get_summary()
-    assert summary is not None
-    assert {c.topic for c in summary.channels.values()} == {
-        "/tf",
-        *(f"/{camera}/{kind}" for camera in ("front", "left") for kind in ("rgb", "depth", "labels", "calibration")),
-    }
-    for schema, channel, stamp, message in found:
-        assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
-        described = json.loads(schema.data)
-        assert set(message) == set(described["properties"]) and described["title"] == schema.name
-        assert stamp == message["timestamp"]["sec"] * 10**9 + message["timestamp"]["nsec"]
-        for name, value in described["properties"].items():
-            assert isinstance(message[name], _TYPES[value["type"]]), name
+    path = tmp_path / "foxglove.mcap"
+    assert exported(write_log(tmp_path / "log.mcap", frames), path).frames == 4
     by_topic: dict[str, list[dict[str, Any]]] = {}
-    for _, channel, _, message in found:
-        by_topic.setdefault(channel.topic, []).append(message)
-    for frame, tf in zip(frames, by_topic["/tf"], strict=True):
-        assert (tf["parent_frame_id"], tf["child_frame_id"]) == ("world", frame.camera_id)
-        R = Rotation.from_quat([tf["rotation"][k] for k in "xyzw"]).as_matrix()
-        np.testing.assert_allclose(R, frame.T_world_camera[:3, :3], atol=1e-12)
-        assert [tf["translation"][k] for k in "xyz"] == frame.T_world_camera[:3, 3].tolist()
-    image = by_topic["/front/rgb"][0]
-    pixels = cv2.imdecode(np.frombuffer(b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR)
-    assert image["format"] == "png" and np.array_equal(pixels[..., ::-1], frames[0].rgb)
+    types = {"object": dict, "string": str, "integer": int, "array": list, "number": float}
+    with path.open("rb") as file:
+        for schema, channel, read in mcap.reader.make_reader(file, validate_crcs=True).iter_messages():
+            assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
+            described, message = json.loads(schema.data), json.loads(read.data)
+            assert set(message) == set(described["properties"]) and described["title"] == schema.name
+            assert read.log_time == message["timestamp"]["sec"] * 10**9 + message["timestamp"]["nsec"]
+            for name, value in described["properties"].items():
+                assert isinstance(message[name], types[value["type"]]), name
+                assert (value.get("contentEncoding") == "base64") == (name == "data")
+            by_topic.setdefault(channel.topic, []).append(message)
+    kinds = [f"/{camera}/{kind}" for camera in ("front", "left") for kind in ("rgb", "depth", "labels", "calibration")]
+    assert set(by_topic) == {"/tf", *kinds}
+    assert frames[0].depth_m is not None and frames[1].label is not None
+    for topic, rgb in (("/front/rgb", frames[0].rgb), ("/left/labels", LABELS.colorize(frames[1].label))):
+        pixels = cv2.imdecode(np.frombuffer(b64decode(by_topic[topic][0]["data"]), np.uint8), cv2.IMREAD_COLOR)
+        assert by_topic[topic][0]["format"] == "png" and np.array_equal(pixels[..., ::-1], rgb)
     mm, metres = by_topic["/front/depth"]
     assert (mm["encoding"], mm["step"]) == ("16UC1", 48) and (metres["encoding"], metres["step"]) == ("32FC1", 96)
-    assert frames[0].depth_m is not None
     units = np.frombuffer(b64decode(mm["data"]), "<u2").reshape(18, 24)
     assert np.array_equal(units.astype(np.float32) / np.float32(1000), frames[0].depth_m)
     assert np.array_equal(np.frombuffer(b64decode(metres["data"]), "<f4").reshape(18, 24), odd)
-    drawn = cv2.imdecode(np.frombuffer(b64decode(by_topic["/left/labels"][0]["data"]), np.uint8), cv2.IMREAD_COLOR)
-    assert frames[1].label is not None and np.array_equal(drawn[..., ::-1], LABELS.colorize(frames[1].label))
     calibration = by_topic["/left/calibration"][0]
     assert calibration["K"] == [20.5, 0, 11.5, 0, 21.0, 8.5, 0, 0, 1] and len(calibration["P"]) == 12
-
-
-_TYPES: dict[str, Any] = {"object": dict, "string": str, "integer": int, "array": list, "number": float}
-
-
-def test_a_foxglove_file_sends_its_reader_to_the_log(log: Path, tmp_path: Path) -> None:
-    exported(log, tmp_path / "foxglove.mcap")
-    words = "for Foxglove.*use the log"
-    with pytest.raises(ImportSourceError, match=words):
-        import_recording(tmp_path / "foxglove.mcap", tmp_path / "back.mcap")
-    with pytest.raises(LogError, match=words):
-        LogReader(tmp_path / "foxglove.mcap")
+    with pytest.raises(ImportSourceError, match=r"for Foxglove.*use the log"):
+        import_recording(path, tmp_path / "back.mcap")
+    with pytest.raises(LogError, match=r"for Foxglove.*use the log"):
+        LogReader(path)
     with pytest.raises(ImportSourceError, match="is a log already; replay it as it is"):
-        import_recording(log, tmp_path / "back.mcap")
+        import_recording(tmp_path / "log.mcap", tmp_path / "back.mcap")
 
 
 def test_one_camera_of_several(tmp_path: Path) -> None:
@@ -206,7 +181,7 @@ def test_one_camera_of_several(tmp_path: Path) -> None:
     assert stamps.tolist() == [frames[i].stamp_ns for i in (1, 3, 5)]
 
 
-def test_what_cannot_be_written_is_refused_and_nothing_is_left(log: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused_and_what_is_damaged_left_out(log: Path, tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     before = log.read_bytes()
     for out, name, error, message in (
@@ -222,13 +197,9 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(log: Path, tmp_pa
     same = write_log(tmp_path / "back.mcap", [turned(0, camera_id="x"), turned(1, stamp_ns=10**18, camera_id="x")])
     report = exported(same, tmp_path / "poses.tum")
     assert report.frames == 1 and "same time" in report.left_out[0]
-    assert log.read_bytes() == before
+    assert log.read_bytes() == before and is_log(log) and is_log(tmp_path) and not is_log(tmp_path / "map.npz")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["back.mcap", "log.mcap", "poses.tum", "there"]
-
-
-def test_damaged_frames_are_left_out(log: Path, tmp_path: Path) -> None:
-    assert is_log(log) and is_log(tmp_path) and not is_log(tmp_path / "map.npz")
-    data = bytearray(log.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    log.write_bytes(data)
+    damaged = bytearray(before)
+    damaged[len(damaged) // 2] ^= 0xFF
+    log.write_bytes(damaged)
     assert exported(log, tmp_path / "sequence").frames == 6

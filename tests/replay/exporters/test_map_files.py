@@ -12,7 +12,6 @@ import rerun.chunk
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import ROOMS, make_label_set
-from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.queries.instances import Instance, OrientedBox
@@ -86,12 +85,8 @@ def test_a_mesh_keeps_its_place_and_faces_through_glb(corner: VoxelMap, tmp_path
     np.testing.assert_array_equal(read["POSITION"], mesh.vertices)
     np.testing.assert_array_equal(read["indices"].reshape(-1, 3), mesh.faces)
     np.testing.assert_array_equal(read["_LABEL"], mesh.label)
-    assert set(np.unique(mesh.label)) >= {9, 2}
     wall, floor = read["POSITION"][read["_LABEL"] == 2], read["POSITION"][read["_LABEL"] == 9]
     assert abs(np.median(wall[:, 1]) - 2) < 0.01 and abs(np.median(floor[:, 2])) < 0.01
-    model = load_open3d().io.read_triangle_model(str(tmp_path / "map.glb")).meshes[0].mesh
-    corners = np.asarray(model.vertices)[np.asarray(model.triangles)].reshape(-1, 3)  # y up: the wall stands at z = -2
-    np.testing.assert_allclose(corners, mesh.vertices[mesh.faces].reshape(-1, 3)[:, (0, 2, 1)] * (1, 1, -1), atol=1e-5)
 
 
 def test_weight_and_confidence_leave_out_what_is_less_sure(corner: VoxelMap, tmp_path: Path) -> None:
@@ -122,7 +117,7 @@ def test_a_plan_says_what_was_found_and_costs_are_read_by_class(corner: VoxelMap
     assert set(costs) == {10, 50, 90, 255} and ((costs == 255) == (plan == 205)).all()
     assert (costs[plan == 0] == 90).mean() > 0.8 and (costs[plan == 254] == 10).mean() > 0.8
     for text, message in (
-        ("flor = 1", "'flor' is no class of the map; it has "),
+        ("flor = 1", "flor = 1: a cost is a whole number .* of one of the classes floor, table"),
         ("floor = 101", "a cost is a whole number from 0"),
         ("floor = true", "a cost is a whole number from 0"),
         ("floor", "costs.toml"),

@@ -1,20 +1,31 @@
+"""Logs as they are written, cut off, damaged, and made by other tools: what is whole is read, and nothing else."""
+
 from __future__ import annotations
 
 import random
 import signal
+import struct
 import subprocess
 import sys
 import threading
+import tracemalloc
+import zlib
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
+import lz4.frame
 import mcap.reader
 import mcap.writer
 import msgpack
 import numpy as np
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.log import reader as log_reader
 from semantic_mapper.replay.log.format import LogReader, LogWriter, recover
 from semantic_mapper.transport.codec import encode, encode_frame, pack_parts
 from semantic_mapper.transport.messages import StreamInfo
@@ -47,12 +58,8 @@ def test_frames_come_back_bit_for_bit(small_log: Path) -> None:
             assert frame.depth_m is not None and expected.depth_m is not None
             assert frame.depth_m.tobytes() == expected.depth_m.tobytes()
         assert not reader.errors and not reader.notices
-
-
-def test_log_bytes_are_wire_bytes_and_open_to_other_readers(small_log: Path) -> None:
-    with small_log.open("rb") as file:
-        reader = mcap.reader.make_reader(file, validate_crcs=True)
-        messages = [(schema, channel, message) for schema, channel, message in reader.iter_messages(["frame/front"])]
+    with small_log.open("rb") as file:  # wire bytes, open to other readers
+        messages = list(mcap.reader.make_reader(file, validate_crcs=True).iter_messages(["frame/front"]))
     assert len(messages) == FRAMES
     for seq, (schema, channel, message) in enumerate(messages):
         assert channel.message_encoding == "msgpack"
@@ -188,19 +195,6 @@ def test_a_log_cut_anywhere_is_readable_up_to_the_break(small_log: Path, tmp_pat
             LogReader(cut_log)
 
 
-def test_a_valid_chunk_with_an_undecodable_frame_costs_that_frame(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    with LogWriter(path, StreamInfo("test")) as writer:
-        for seq in range(4):
-            parts = encode_frame(samples.make_frame(seq))
-            if seq == 2:
-                parts[2] = bytes(len(parts[2]))  # no PNG any more, of the right length
-            writer.write_parts(parts)
-    with LogReader(path) as reader:
-        assert seqs(reader) == [0, 1, 3]
-        assert "frame 2 at byte" in str(reader.errors[0]) and "PNG" in str(reader.errors[0])
-
-
 @pytest.mark.parametrize("compression", [mcap.writer.CompressionType.ZSTD, mcap.writer.CompressionType.NONE])
 def test_a_log_that_another_tool_rewrote_is_read(small_log: Path, tmp_path: Path, compression) -> None:
     rewritten = tmp_path / "rewritten.mcap"
@@ -218,23 +212,6 @@ def test_a_log_that_another_tool_rewrote_is_read(small_log: Path, tmp_path: Path
         writer.finish()
     with LogReader(rewritten) as again:
         assert seqs(again) == list(range(FRAMES)) and not again.errors
-
-
-def test_recover_writes_a_clean_log_of_what_is_whole(small_log: Path, tmp_path: Path) -> None:
-    chunks = chunk_starts(small_log)
-    data = bytearray(small_log.read_bytes())[: chunks[10][0] + 50]  # frames 0 to 8 are whole
-    data[chunks[4][0] + 200] ^= 1
-    damaged, clean = tmp_path / "damaged.mcap", tmp_path / "clean.mcap"
-    damaged.write_bytes(data)
-    report = recover(damaged, clean)
-    assert (report.frames, report.finished, len(report.lost)) == (8, False, 2)
-    with LogReader(clean) as reader:
-        assert reader.finished and not reader.notices
-        assert seqs(reader) == [0, 1, 2, 4, 5, 6, 7, 8] and not reader.errors
-        assert reader.info.label_set == NYU40
-    assert damaged.read_bytes() == data
-    with pytest.raises(LogError, match="exists already"):
-        recover(damaged, clean)
 
 
 WRITER = """
@@ -268,3 +245,73 @@ def test_a_killed_writer_loses_at_most_the_message_it_was_writing(tmp_path: Path
         assert not reader.finished
     assert found[: last + 1] == list(range(last + 1))  # all that was said to be written
     assert len(found) <= last + 2
+
+
+COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "lz4": lz4.frame.compress, "zstd": zstandard.compress}
+EMPTY_MESSAGE = struct.pack("<BQ", Opcode.MESSAGE, 22) + bytes(22)
+ZEROS = bytes(1 << 24)
+STRANGE = struct.pack("<BQ", Opcode.SCHEMA, 1 << 63) + bytes(20)
+
+
+def with_chunk(log: Path, compression: str, data: bytes, size: int, crc: int = 0) -> Path:
+    """The log with this chunk behind its frames; the index does not know it."""
+    whole = log.read_bytes()
+    end = whole.rfind(struct.pack("<BQ", Opcode.DATA_END, 4))
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name + struct.pack("<Q", len(data)) + data
+    log.write_bytes(whole[:end] + struct.pack("<BQ", Opcode.CHUNK, len(body)) + body + whole[end:])
+    return log
+
+
+@pytest.mark.parametrize(
+    ("compression", "data", "size", "reason"),
+    [
+        ("", STRANGE, len(STRANGE), "longer than its chunk"),
+        ("", bytes(9) * 1000, 9000, "opcode 0"),
+        ("", EMPTY_MESSAGE * 70_000, 31 * 70_000, "more than 65,536 records"),
+        ("zstd", b"no such thing", 100, "damaged"),
+        ("lz4", b"no such thing", 100, "damaged"),
+        ("xz", b"no such thing", 100, "'xz', which is not known"),
+        ("lz4", lz4.frame.compress(ZEROS), 1000, "another size"),
+        ("zstd", zstandard.compress(ZEROS), 1000, "another size"),
+        ("zstd", b"", (1 << 27) + 1, "128 MiB"),
+    ],
+)
+def test_a_strange_chunk_is_one_error_and_takes_no_memory(
+    small_log: Path, compression: str, data: bytes, size: int, reason: str
+) -> None:
+    path = with_chunk(small_log, compression, data, size)
+    tracemalloc.start()
+    with LogReader(path) as log:
+        assert len(list(log)) == FRAMES
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert len(log.errors) == 1 and reason in str(log.errors[0]), log.errors
+    assert peak < 1 << 24
+    report = recover(path, path.with_name("clean.mcap"))
+    assert report.frames == FRAMES and len(report.lost) == 1
+    with pytest.raises(LogError, match="exists already"):
+        recover(path, path.with_name("clean.mcap"))
+
+
+def test_messages_of_one_chunk_unpack_it_once(small_log: Path) -> None:
+    with LogReader(small_log) as log:
+        payloads = [pack_parts(parts) for envelope, parts in log.messages() if envelope.topic == "frame"]
+    inner = b"".join(struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + len(p), 9, 0, 0, 0) + p for p in payloads)
+    packer = zstandard.ZstdCompressor().compressobj()  # a stream does not tell the size of what it holds
+    packed = packer.compress(inner) + packer.flush()
+    with LogReader(with_chunk(small_log, "zstd", packed, len(inner), zlib.crc32(inner))) as log:
+        with patch.object(log_reader, "read_payloads", wraps=log_reader.read_payloads) as reads:
+            assert len(list(log)) == 2 * FRAMES and not log.errors
+        assert reads.call_count == FRAMES + 1
+
+
+def test_a_damaged_head_costs_nothing_but_what_follows_it_where_there_is_no_index(small_log: Path) -> None:
+    data = bytearray(small_log.read_bytes())
+    data[chunk_starts(small_log)[5][0] + 5] ^= 0xFF  # of the record's length
+    small_log.write_bytes(data)
+    with LogReader(small_log) as log:  # the index names the chunks behind it
+        assert len(list(log)) == FRAMES and log.finished
+    small_log.write_bytes(data[:-1000])  # without its index
+    with LogReader(small_log) as log:
+        assert len(list(log)) == 4 and not log.finished and "passed over" in str(log.errors[0])

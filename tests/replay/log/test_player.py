@@ -135,6 +135,9 @@ def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: s
     report, mapper = play_to(path, endpoint, fuse)
     assert mapper.seqs == [0, 2, 3, 4] and report.published == 4
     assert len(report.errors) == 1 and "seq=1" in str(report.errors[0])
+    with LogReader(path) as reader:
+        assert [frame.seq for frame in reader] == [0, 2, 3, 4]
+        assert "frame 1 at byte" in str(reader.errors[0]) and "PNG" in str(reader.errors[0])
     end = mapper.received[-1]
     assert isinstance(end, EndOfStream) and end.unreadable == 1 and "seq=1" in end.damages[0]
 
