@@ -235,6 +235,9 @@ class Running:
         self._reader.join(10)
         return code
 
+    def sockets(self) -> Path:
+        return Path(self.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
+
     def node_pids(self) -> list[int]:
         return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
 

@@ -11,7 +11,6 @@ from semantic_mapper.errors import ConfigError, PoseError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.exporters.map_files import parse_transform
 from tests.mapping.rendered_views import small_map
-from tests.mapping.test_formats import read_glb
 from tests.mapping.test_voxel_map import fuse_sphere
 from tests.nodes.support import refused, run_ok
 
@@ -25,14 +24,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fuse_sphere(voxel_map, frames)
         voxel_map.save(folder / f"{name}.npz")
     return folder
-
-
-def test_a_folder_of_results_becomes_a_glb(results: Path, tmp_path: Path) -> None:
-    out = tmp_path / "new" / "sphere.glb"
-    said = run_ok("export", results, "--out", out, "--color", "class", "--up", "-y").stdout
-    mesh = VoxelMap.load(results / "map.npz").mesh()
-    assert f"{out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces" in said
-    np.testing.assert_array_equal(read_glb(out)[1]["_LABEL"], mesh.label)
 
 
 def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:

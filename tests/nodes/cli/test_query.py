@@ -1,8 +1,9 @@
-"""The command on a saved map of a known scene."""
+"""The command on a saved map of a known scene, and ``query MAP relocalize LOG``."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,13 @@ import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
+from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import answer, open_saved
+from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.transport.messages import StreamInfo
+from tests.mapping.rendered_views import small_map
+from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, refused, run, run_ok
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
@@ -113,3 +119,34 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
         assert "cup" in done.stdout and json.loads((folder / "live.json").read_text())["map"] == service.endpoint
         said = refused("query", service.endpoint, "nearest", "kettle", "0", "0", "0")
         assert "floor, table, cup, lamp" in said
+
+
+def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
+    small_map().save(tmp_path / "map.npz")
+    (tmp_path / "bad.mcap").touch()
+    assert "has nothing to find oneself by" in refused(
+        "query", tmp_path / "map.npz", "relocalize", tmp_path / "bad.mcap"
+    )
+
+
+def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: Path) -> None:
+    even().voxel_map.save(tmp_path / "map.npz")
+    log_path = tmp_path / "today.mcap"
+    with LogWriter(log_path, StreamInfo("today", {"rooms": INTRINSICS}, ROOMS, 4, 15.0)) as log:
+        for frame in walk()[1:14:4]:
+            log.write_frame(replace(abroad(frame, 0), label=None))
+        log.write_frame(replace(walk()[15], world=2, label=None))
+        data = log_path.stat().st_size
+        log.write_frame(replace(walk()[15], world=2, label=None))
+    whole = bytearray(log_path.read_bytes())
+    whole[data + 5000] ^= 0xFF
+    log_path.write_bytes(bytes(whole))
+    found = run("query", tmp_path / "map.npz", "relocalize", log_path, "--json")
+    assert found.returncode == 1, found.stderr
+    told = json.loads(found.stdout)
+    assert (told["frames"], told["found"], told["refused"]) == (5, 5, {})
+    assert [frame["number"] for frame in told["unreadable"]] == [5]
+    assert [(w["world"], w["agreeing"]) for w in told["sessions"]] == [(0, 4), (2, 1)]
+    assert off(np.array(told["sessions"][0]["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
+    alone = told["sessions"][1]
+    assert alone["T_map_world"] is None and alone["disagreement"] == "1 of 3 frames agree on it"

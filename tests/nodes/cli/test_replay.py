@@ -1,4 +1,4 @@
-"""``replay``: what it writes, what it says, and what it does about bad input."""
+"""``replay`` and ``demo``: what they write and say, and what they do about bad input and folders that others use."""
 
 from __future__ import annotations
 
@@ -10,7 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.nodes.support import Running, refused, repeated_frames, run, run_ok, summary_of, write_log, write_weights
+from semantic_mapper.replay.run_folder import hold_folder
+from tests.nodes.support import (
+    REPLAY_LAUNCH,
+    Running,
+    refused,
+    repeated_frames,
+    run,
+    run_ok,
+    summary_of,
+    write_log,
+    write_weights,
+)
 from tests.small import tiny_frames
 
 
@@ -99,3 +110,36 @@ def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path
     assert run(*command).returncode == 3
     run_ok(*command, "--accept-contradictions")
     assert "x forward" in summary_of(tmp_path / "run")["pose_check"]["warning"]
+
+
+@pytest.mark.slow  # 24 frames
+def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    said = run_ok("demo", "--out", out, "--voxel-size", "0.05", "--quality", "fast").stdout
+    summary = summary_of(out)
+    assert summary["frames"]["fused"] == summary["frames"]["published"] > 10
+    assert summary["metrics"]["miou"] is not None and "demo.mcap" in said
+    for name in ("map.ply", "map.npz", "overview.png"):
+        assert (out / name).stat().st_size > 0 and name in said
+
+
+def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with hold_folder(out):
+        for words in (("up", REPLAY_LAUNCH, "--set", f"camera.log={log}"), ("replay", log)):
+            assert "another run writes its results there" in refused(*words, "--out", out)
+        with hold_folder(tmp_path / "other"):
+            pass
+    assert not any(out.iterdir())
+
+
+def test_a_refused_run_leaves_no_folder_and_a_stopped_one_what_it_has_written(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no log")
+    (tmp_path / "pictures").mkdir()
+    for name in ("bad.mcap", "pictures"):
+        assert name in refused("replay", tmp_path / name, "--out", tmp_path / "runs" / "out")
+        assert not (tmp_path / "runs").exists()
+    with pytest.raises(FileExistsError), hold_folder(tmp_path / "out"):  # noqa: PT012
+        (tmp_path / "out" / "map.npz").touch()
+        (tmp_path / "out" / "map.npz").touch(exist_ok=False)
+    assert (tmp_path / "out" / "map.npz").exists()

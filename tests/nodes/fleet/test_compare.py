@@ -16,14 +16,11 @@ from tests.nodes.fleet.made_up import FINISHED_NS, failure_of, made_up, store_of
 
 
 @pytest.fixture
-def compared(tmp_path: Path) -> Any:
-    """Compares two lists of results; names of stores are given out one after the other."""
-    count = 0
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Compares two lists of results."""
 
     def compare(before: Sequence[TaskResult], after: Sequence[TaskResult], **options: Any) -> FleetComparison:
-        nonlocal count
-        count += 1
-        a, b = (store_of(tmp_path / f"{name}{count}", found) for name, found in (("a", before), ("b", after)))
+        a, b = (store_of(tmp_path_factory.mktemp("store"), found) for found in (before, after))
         return compare_stores(a, b, **options)
 
     return compare

@@ -80,21 +80,19 @@ def learning_robot(weights: Path, out: Path, **more: object) -> Iterator[Learner
 def better(path: Path, seed: int = 0) -> Checkpoint:
     """Weights that say the same, but are other ones, with four more keyframes."""
     start = load_checkpoint(path)
-    model = copy.deepcopy(start.model)
     with torch.no_grad():
-        model.state_dict()["classifier.bias"] += 1e-3 * (1 + seed)
-    recipe = {**start.recipe, "train_stamps_ns": [f.stamp_ns for f in FRAMES[:5]]}
-    return Checkpoint(model, start.anchors, recipe)
+        start.model.state_dict()["classifier.bias"] += 1e-3 * (1 + seed)
+    return Checkpoint(start.model, start.anchors, {**start.recipe, "train_stamps_ns": [f.stamp_ns for f in FRAMES[:5]]})
 
 
 def misled(path: Path) -> Checkpoint:
     """Weights that call each class as the next one, and are sure of it."""
     start = load_checkpoint(path)
-    model = copy.deepcopy(start.model)
+    state = start.model.state_dict()
     with torch.no_grad():
         for name in SRay.class_rows:
-            model.state_dict()[name].copy_(torch.roll(model.state_dict()[name], 1, 0))
-    return Checkpoint(model, tuple(permuted(a) for a in start.anchors), start.recipe)
+            state[name].copy_(torch.roll(state[name], 1, 0))
+    return Checkpoint(start.model, tuple(permuted(a) for a in start.anchors), start.recipe)
 
 
 @pytest.mark.slow
@@ -124,9 +122,8 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
             with pytest.raises(MapError, match=says):
                 learner.client.return_to_weights(version)
         learner.robot.send([FRAMES[6], FRAMES[7]])
-        assert learner.robot.fused(8) and eventually(
-            lambda: learner.robot.status[-1].counters.get("weights_version") == 2
-        )
+        assert learner.robot.fused(8)
+        assert eventually(lambda: learner.robot.status[-1].counters.get("weights_version") == 2)
         summary = learner.robot.end(8)
     told = summary["weights"]
     assert told["learned"]["in_use"] == 2 and told["learned"]["rolled_back"] == 1

@@ -226,8 +226,6 @@ def test_a_mirror_elsewhere_is_the_growing_map(endpoint: str) -> None:
         caught_up(client, voxel_map)
         assert client.mirror() is mirror and mirror.snapshot().epoch == 1
         assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
-        with MapClient(endpoint, timeout_s=60) as late:
-            assert_same(late.mirror().snapshot(), MapMirror.of(voxel_map).snapshot())
 
 
 def caught_up(client: MapClient, voxel_map: VoxelMap) -> None:
@@ -253,15 +251,8 @@ def test_nobody_at_home(endpoint: str) -> None:
     with MapClient(endpoint, timeout_s=0.05, attempts=2) as client:
         with pytest.raises(TransportError, match=r"no answer within 2 x 0.05 s; is a mapper running"):
             client.info()
-        with answering(endpoint, small_map(LABELS)):
-            while True:  # it may compile first
-                try:
-                    assert client.info().blocks == 0
-                    break
-                except TransportError:
-                    continue
-            with pytest.raises(TransportError, match="another process listens there"):
-                QueryService(endpoint, small_map(LABELS))
+        with answering(endpoint, small_map(LABELS)), pytest.raises(TransportError, match="another process listens"):
+            QueryService(endpoint, small_map(LABELS))
     with pytest.raises(TransportError, match="the client is closed"):
         client.info()
 
@@ -271,9 +262,7 @@ def test_where_the_last_frame_was_taken_is_told(endpoint: str) -> None:
     with QueryService(endpoint, whole_map(), pose_in_map=pose_in_map), MapClient(endpoint, timeout_s=60) as client:
         assert client.pose() is None
         pose_in_map.last = CameraPose("oak", 5, None, "looking")
-        unknown = client.pose()
-        assert unknown is not None and unknown.T_map_camera is None
-        assert (unknown.camera_id, unknown.stamp_ns, unknown.reason) == ("oak", 5, "looking")
+        assert client.pose() == pose_in_map.last
         pose_in_map.last = CameraPose("oak", 6, pose)
         known = client.pose()
         assert known is not None and known.reason == "" and np.array_equal(known.T_map_camera, pose)

@@ -115,7 +115,7 @@ def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str)
 
 
 def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -> None:
-    path, contents = tmp_path / "map.npz", {}
+    path, contents, results = tmp_path / "map.npz", [], {"map.npz", "summary.json", "map-before-restart-1.npz"}
     for launch in range(3):  # all saved in the same second, by their stamps
         first, second = (context(tmp_path / f"notes-{launch}", restarts) for restarts in range(2))
         resume_map(first, path, VoxelMap(CONFIG, ROOMS))
@@ -123,18 +123,16 @@ def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -
         assert not path.exists() and not (tmp_path / "summary.json").exists()
         some_map(launch + 1).save(path)
         os.utime(path, (1.8e9 + launch / 10, 1.8e9 + launch / 10))
-        contents[launch] = path.read_bytes()
-        (tmp_path / "summary.json").write_text(str(launch))
-        (tmp_path / "map-before-restart-1.npz").write_text(str(launch))
-        (tmp_path / "recorded.mcap").write_text("the recorder's")
+        contents.append(path.read_bytes())
+        for name in ("summary.json", "map-before-restart-1.npz", "recorded.mcap"):  # the last is the recorder's
+            (tmp_path / name).write_text(str(launch))
         assert f"after {launch + 1} frames" in resume_map(second, path, VoxelMap(CONFIG, ROOMS))
         keep_earlier(second, path)
-        assert path.exists(), "this launch's own"
+        assert path.read_bytes() == contents[-1], "this launch's own"
     for launch, name in enumerate(("earlier-20270115T080000Z", "earlier-20270115T080000Z-1")):
+        assert {p.name for p in (tmp_path / name).iterdir()} == results
         assert (tmp_path / name / "map.npz").read_bytes() == contents[launch]
-        assert {p.name for p in (tmp_path / name).iterdir()} == {"map.npz", "summary.json", "map-before-restart-1.npz"}
         assert (tmp_path / name / "summary.json").read_text() == str(launch)
-    assert path.read_bytes() == contents[2]
 
 
 def test_a_live_launch_keeps_earlier_results_a_replay_replaces_them(tmp_path: Path, weights: Path) -> None:

@@ -15,12 +15,12 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 import rerun.chunk
-from rerun import RecordingStream
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.process import StopRequest
@@ -121,21 +121,12 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
 
 
 def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
-    done: list[int | None] = []
-
-    class Monitor(JobMonitor):
-        def start(self, total: int | None) -> None:
-            done.append(total)
-
-        def set(self, frames: int, note: str = "") -> None:
-            done.append(frames)
-
-    def begin() -> RecordingStream:
-        return recording_file(tmp_path / "log.rrd")
-
-    show_log(log, weights, tiny_config(), 5, begin, 0.0, lambda: len(done) < 4, Monitor())
-    assert done == [5, 1, 2, 3], "asked to end after the third frame"
-    rows = logged(tmp_path / "log.rrd")
+    monitor, path = Mock(spec=JobMonitor), tmp_path / "log.rrd"
+    options = (5, lambda: recording_file(path), 0.0, lambda: monitor.set.call_count < 3, monitor)
+    show_log(log, weights, tiny_config(), *options)
+    monitor.start.assert_called_once_with(5)
+    assert monitor.set.call_count == 3, "asked to end after the third frame"
+    rows = logged(path)
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
     assert rows[f"{camera}/rgb"] == rows[f"{camera}/semantics"] == rows[f"{camera}/depth"] == 3
     assert rows["/stage_ms/fuse"] == 3 and rows["/legend"] >= 2
