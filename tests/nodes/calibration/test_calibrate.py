@@ -23,8 +23,8 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.calibrating.boards import BOARD, LENS, picture, shown
 from tests.drivers.support import write_film
+from tests.mapping.test_blocks import files_at_most
 from tests.nodes.support import refused, run_ok
-from tests.replay.log.test_recording import files_at_most
 
 SETTINGS = CalibrationSettings(board=BOARD)
 BOARD_FILE = '[board]\nkind = "board"\ncolumns = 8\nrows = 6\nsquare_m = 0.04\nmarker_m = 0.03\n'

@@ -54,10 +54,8 @@ ERRORS = (  # of what is heavy where it goes well
     "autolabel none.mcap --weights rooms --out x.mcap",
     "label none.mcap --suggest 3",
     "merge none.npz map.npz --out x.npz",
-    "calibrate none",
     "fleet run replay none.mcap --out x",
     "refine none.npz --out x.npz",
-    "view none.mcap",
     "up none.toml",
 )
 

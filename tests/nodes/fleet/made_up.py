@@ -63,15 +63,8 @@ def made_up(log: int, *, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
 
 
 def failure_of(result: TaskResult, error: str = "LogError: cut off") -> Failure:
-    return Failure(
-        key="f" + result.key[1:],
-        operation=result.operation,
-        log=result.log,
-        tags=result.tags,
-        version=VERSION,
-        error=error,
-        finished_ns=FINISHED_NS,
-    )
+    given = {name: getattr(result, name) for name in ("operation", "log", "tags")}
+    return Failure(key="f" + result.key[1:], **given, version=VERSION, error=error, finished_ns=FINISHED_NS)
 
 
 def store_of(url: Path | str, results: Sequence[TaskResult] = ()) -> Store:

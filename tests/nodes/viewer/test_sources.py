@@ -56,9 +56,8 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
     with WebViewer(0, 0) as viewer:
         page, data = urlsplit(viewer.page_url), urlsplit(viewer.data_url)
         assert parse_qs(page.query)["url"] == [viewer.data_url]
-        assert (
-            page.port and data.port and addresses_listening(page.port) == addresses_listening(data.port) == {"0100007F"}
-        )
+        assert page.port and data.port
+        assert addresses_listening(page.port) == addresses_listening(data.port) == {"0100007F"}
         connection = http.client.HTTPConnection(page.hostname or "", page.port, timeout=10)
         connection.request("GET", f"/?{page.query}")
         answer = connection.getresponse()

@@ -16,7 +16,7 @@ import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.labels import NYU40
-from semantic_mapper.replay.importers import import_recording
+from semantic_mapper.replay.importers.run import import_recording
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter, recover
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
