@@ -63,9 +63,8 @@ def _open3d() -> Iterator[Check]:
     """In a process of its own: a broken library may end a process instead of raising."""
     code = "from semantic_mapper.mapping.open3d_loader import load_open3d as l; print(l().__version__)"
     try:
-        done = subprocess.run(
-            [sys.executable, "-I", "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
-        )
+        command = [sys.executable, "-I", "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
         yield Check("Open3D", "bad", f"did not load within {PROBE_TIMEOUT_S:g} s", "is the disk very slow?")
         return

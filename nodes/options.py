@@ -13,6 +13,10 @@ SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which lo
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
 CAMERA_KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd", "visual")
+POSE_HELP = (
+    '"topic" (odometry from a socket), "board" (a printed board), "rgbd" (odometry from depth), "visual" (from '
+    'pictures), "fixed" (it never moves)'
+)
 TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 ENDPOINT_NAME_PATTERN = r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z"  # a socket of the launch, or an endpoint
@@ -29,9 +33,7 @@ def check_tracking(camera_kind: str, pose_kind: object) -> None:
     if pose_kind == "device" and camera_kind in CAMERA_KINDS and camera_kind not in TRACKING_KINDS:
         raise ValueError(
             f'poses = {{ kind = "device" }}: cameras of kind "{camera_kind}" do not track themselves, and no frame '
-            f'would have a pose (only {", ".join(TRACKING_KINDS)} does); use kind = "topic" (odometry from a socket), '
-            '"board" (a printed board), "rgbd" (odometry from depth), "visual" (from pictures) or "fixed" (it never '
-            "moves)"
+            f"would have a pose (only {', '.join(TRACKING_KINDS)} does); use kind = {POSE_HELP}"
         )
 
 
@@ -52,10 +54,8 @@ class LiveCamera(Config, frozen=True):
 
     def __post_init__(self) -> None:
         if self.poses in POSE_KINDS and not Path(str(self.poses)).exists():
-            raise ValueError(
-                f'poses = "{self.poses}" names a file of settings that does not exist; for poses of that kind write '
-                f'poses = {{ kind = "{self.poses}" }}'
-            )
+            fix = f'poses = {{ kind = "{self.poses}" }}'
+            raise ValueError(f'poses = "{self.poses}" names a file that does not exist; for that kind write {fix}')
 
 
 def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:

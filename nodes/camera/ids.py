@@ -24,8 +24,7 @@ def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions]) -> None:
             if options.log is not None or cameras[other].log is not None:
                 fix = (
                     "frames of a log keep the names that they were recorded under: record one again with another `id`, "
-                    "or give each log a mapper of its own; parts of one recording are one node, whose `log` is their "
-                    "folder"
+                    "or give each log a mapper of its own; parts of one recording are one node with their folder"
                 )
             raise ValueError(f"two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {fix}")
 

@@ -95,7 +95,5 @@ def _draw_board(output: Output, settings: CalibrationSettings, path: Path) -> No
     prepare_file(path)
     write_bytes(path, sheet_png(settings.board), raises=ConfigError)
     b = settings.board
-    output.print(
-        f"{path}: {b.columns} x {b.rows} squares of {1000 * b.square_m:g} mm; print it at 100 %, on "
-        "something flat, and measure a square"
-    )
+    squares = f"{b.columns} x {b.rows} squares of {1000 * b.square_m:g} mm"
+    output.print(f"{path}: {squares}; print it at 100 %, on something flat, and measure a square")

@@ -74,9 +74,8 @@ def export(
         return
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
-    request = ExportRequest(
-        format_of(out, format_), min_weight, min_confidence, color, parse_up(up), height, resolution, floor, costs
-    )
+    of_grid = (height, resolution, floor, costs)
+    request = ExportRequest(format_of(out, format_), min_weight, min_confidence, color, parse_up(up), *of_grid)
     path = map_path(source)
     refuse_overwriting(out, path)
     prepare_file(out)

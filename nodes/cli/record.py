@@ -64,14 +64,9 @@ def record(
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     prepare_file(log)
-    wanted = {
-        "out": str(log),
-        "source_timeout_s": HEAR_S,
-        "overwrite": overwrite,
-        **recorder.table(),
-        **({"topics": topic} if topic else {}),
-        **({"rgb": "jpeg", "jpeg_quality": jpeg} if jpeg else {}),
-    }
+    wanted = {"out": str(log), "source_timeout_s": HEAR_S, "overwrite": overwrite, **recorder.table()}
+    wanted |= {"topics": topic} if topic else {}
+    wanted |= {"rgb": "jpeg", "jpeg_quality": jpeg} if jpeg else {}
     with StopRequest() as stop, frame_progress("record", None) as bar:
         began = 0.0
 
@@ -93,9 +88,7 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
     """Say what is recorded, and what is not; the exit code."""
     done = recorder.recording
     if done is None:
-        raise LogError(
-            f"{log}: nothing was recorded: no stream has begun; `semantic-mapper view --status` shows the nodes"
-        )
+        raise LogError(f"{log}: nothing was recorded: no stream has begun; `view --status` shows the nodes")
     if done.nothing_left:
         raise LogError(f"{log}: its files were removed while it was recorded; record again")
     parts = f" in {done.parts} parts" if done.parts > 1 else ""

@@ -48,11 +48,8 @@ def up(
     results = print_results(output, fresh)
     for name, summary in results.items():
         if not summary["frames"]["fused"] and not stop:
-            why = (
-                [r["reason"] for r in summary["refusals"]]
-                or summary["damaged_stretches"]
-                or [summary["map"]["nearly_empty"] or "no frames came"]
-            )
+            why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"]
+            why += [summary["map"]["nearly_empty"] or "no frames came"]
             count = summary["frames"]["published"]
             raise LogError(f"{name}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
 

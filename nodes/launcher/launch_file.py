@@ -23,6 +23,7 @@ from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
     ENDPOINT_PATTERN,
     OPTIONS,
+    POSE_HELP,
     POSE_KINDS,
     CameraOptions,
     FinetunerOptions,
@@ -272,11 +273,8 @@ def _check_camera(camera: dict[str, Any], node: str) -> None:
         raise ValueError(f"{what}{nearest(kind, CAMERA_KINDS)}; give --set {node}.kind=KIND")
     if not poses:
         raise ValueError(
-            "`camera.poses` is missing or empty: a camera alone does not know where it is. Give "
-            f"--set {node}.poses.kind=KIND, or in the file [node.options.camera.poses], with kind "
-            '"topic" (odometry from a socket), "board" (a printed board), "rgbd" (odometry from depth), "visual" (from '
-            'its pictures alone), "device" (it tracks itself, OAK) or "fixed" (it never moves); for example '
-            'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
+            "`camera.poses` is missing or empty: a camera alone does not know where it is. Give --set "
+            f'{node}.poses.kind=KIND, or in the file poses = {{ kind = "..." }}: {POSE_HELP}, or "device" (OAK)'
         )
     if isinstance(poses, dict):
         source = str(poses.get("kind", ""))
@@ -312,12 +310,9 @@ def _check_launch(launch: Launch) -> None:
     if restarted and waiting:
         raise ValueError(
             f"node '{restarted[0]}' is to be restarted, but camera '{waiting[0]}' waits for those who read its "
-            f"frames, and what they have lost would be missing in the result; set {waiting[0]}.mode=realtime, or "
-            "restart=never"
+            f"frames, which would miss some; set {waiting[0]}.mode=realtime, or restart=never"
         )
     sockets = launch.sockets()
     if twice := sorted({name for name in sockets if sockets.count(name) > 1}):
-        raise ValueError(
-            f"{', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node "
-            f"('{STATUS_SOCKET}' is the launcher's own)"
-        )
+        own = f"'{STATUS_SOCKET}' is the launcher's own"
+        raise ValueError(f"{', '.join(twice)}: names two endpoints; give each mapper a `query` of its own ({own})")

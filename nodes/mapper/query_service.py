@@ -75,10 +75,9 @@ class QueryService(Closing):
     snapshots.
 
     Args:
-        endpoint: Where to listen.
+        endpoint, keys: See ``QueryServer``, also for errors.
         voxel_map: The map; only ``follow`` and ``hand_over`` read its blocks.
         correction, weights: Take corrected poses and other weights; without them such requests are refused.
-        keys: See ``QueryServer``, also for errors.
         moving: Where something moves now that is left out of the map.
         pose_in_map: Pose of the last frame.
     """

@@ -62,6 +62,7 @@ _QUESTION_PARTS = 5  # who asks, the empty part that REQ sockets put first, and 
 _WAITING = 64  # questions and answers that may wait for each client
 _SERVER_OPTIONS = {zmq.LINGER: 200, zmq.RCVHWM: _WAITING, zmq.SNDHWM: _WAITING, zmq.MAXMSGSIZE: MAX_REQUEST_BYTES}
 _CLIENT_OPTIONS = {zmq.LINGER: 0, zmq.MAXMSGSIZE: MAX_PART_BYTES, zmq.RECONNECT_IVL: 50, zmq.RECONNECT_IVL_MAX: 1000}
+_KEYS_DIFFER = " Does it know this machine's key, and is its own the one we have?"
 _GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
 _TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
 _EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_TRIES_AGAIN)
@@ -141,10 +142,8 @@ class Publisher(Closing):
                 return
             self._closed.wait(0.001)  # let other threads have the socket
             if late:
-                raise TransportError(
-                    f"{self.endpoint}: a subscriber of {topic.decode(errors='replace')} has taken nothing for "
-                    f"{timeout_s:g} s; it hangs or is too slow for a lossless stream"
-                )
+                reader = f"a subscriber of {topic.decode(errors='replace')} has taken nothing for {timeout_s:g} s"
+                raise TransportError(f"{self.endpoint}: {reader}; it hangs or is too slow for a lossless stream")
 
     def remind(self, name: str) -> None:
         """Send the latched messages of a topic once more, for those who had no room for them; waits for nobody."""
@@ -167,10 +166,8 @@ class Publisher(Closing):
             if stop:
                 return False
             if time.monotonic() > deadline:
-                raise TransportError(
-                    f"{self.endpoint}: {there} of {count} subscribers of '{name}' after {timeout_s:g} s; "
-                    "is the other node running, and does it connect to this endpoint?"
-                )
+                there_are = f"{there} of {count} subscribers of '{name}' after {timeout_s:g} s"
+                raise TransportError(f"{self.endpoint}: {there_are}; does the other node run, and connect to this?")
             self._closed.wait(0.005)
         return True
 
@@ -330,10 +327,8 @@ class _Subscriber(Closing):
                 self._changed.wait(min(timeout_s, _POLL_MS / 1000))
             if self._synced >= count and not self._over:
                 return True
-            why = self._over or (
-                f"{self._synced} of {count} publishers have answered within {timeout_s:g} s; is the other node running?"
-                + (" Does it know this machine's key, and is its own the one we have?" if self._identity else "")
-            )
+            why = f"{self._synced} of {count} publishers have answered within {timeout_s:g} s; does the other node run?"
+            why = self._over or why + (_KEYS_DIFFER if self._identity else "")
             raise TransportError(f"{', '.join(self.endpoints)}: {why}")
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
@@ -578,8 +573,7 @@ class QuerySocket(Closing):
                         self._socket = self._connect()
         raise TransportError(
             f"{self.endpoint}: no answer within {self._attempts} x {self._timeout_s:g} s; is a mapper running, and "
-            "does it answer questions there (option `query`)?"
-            + ("" if self._identity is None else " Does it know this machine's key, and is its own the one we have?")
+            f"does it answer questions there (option `query`)?{_KEYS_DIFFER if self._identity else ''}"
         )
 
     def close(self) -> None:
