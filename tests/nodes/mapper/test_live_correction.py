@@ -175,7 +175,7 @@ def test_a_camera_that_closes_a_loop_and_a_file_move_the_map(weights, tmp_path):
         with CorrectionSender(robot.query, frames[0].camera_id) as sender:
             sender.put(CorrectedWorld(poses | unseen, frames[-1].stamp_ns + 10, np.eye(4)))
             assert eventually(lambda: client.correction().completed == 1)
-        assert sender.counters == {"corrections_sent": 1} and sender.warnings == ()
+        assert sender.status().counters == {"corrections_sent": 1} and not any(sender.status().warnings)
         assert client.correction().poses == 8
         file = write_tum(tmp_path / "true.tum", [*frames[::2], far])
         outcome = json.loads(run_ok("query", robot.query, "correct", file, "--json").stdout)
