@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -74,22 +74,11 @@ _LOOKED_AT = np.array([(0, 0, 0), (-1, -0.75, 2), (1, -0.75, 2), (-1, 0.75, 2), 
 _SPREAD_M, _FIT_ROUNDS = 0.02, 5  # of the fit of those that agree
 
 
-class _MapView(Protocol):
-    @property
-    def depth_m(self) -> Float32: ...
-    @property
-    def rgb(self) -> UInt8: ...
-    @property
-    def label(self) -> UInt8: ...
-    @property
-    def confidence(self) -> Float32: ...
-
-
 class MapSurface(Protocol):
     """What can be seen from anywhere, such as ``VoxelMap``."""
 
-    def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> _MapView:
-        """The map as a camera would see it: depth, colour, classes and how sure these are, (H, W) each."""
+    def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> Any:
+        """The map as a camera would see it: depth_m, rgb, label and confidence, (H, W) each."""
         ...
 
 
@@ -126,7 +115,7 @@ class _Tried:
     landmarks: _Landmarks  # that led to the guess
     pose: Float64  # as aligned
     support: _Landmarks  # features that agree on it
-    view: _MapView  # the map as seen from there
+    view: Any  # the map as seen from there
     agreeing: Bool  # (h, w) where the depth is the map's
     overlap: float  # fraction of the measured pixels that show what the map has, too
     agree: float  # fraction of these whose depth is the map's

@@ -1,8 +1,7 @@
 """Which blocks a depth image needs: those that its rays cross within the truncation band.
 
-Every pixel is looked at, for Open3D's own selection takes every fourth and so misses thin things; where the depth is
-smooth the ray through the middle of a small tile of pixels stands for theirs. The loop is in ``allocation.c``.
-"""
+Every pixel counts, for Open3D's own selection takes every fourth and misses thin things; where the depth is smooth, one
+ray stands for a small tile. The loop is in ``allocation.c``."""
 
 from __future__ import annotations
 
@@ -101,11 +100,9 @@ def _steepest(camera: Camera, shape: tuple[int, ...]) -> float:
 
 
 def blocks_in_view(camera: Camera, size: tuple[int, int], keys: Int32, voxel_size_m: float, reach_m: float) -> Int64:
-    """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
-
-    ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis. A block counts
-    whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each side, for a
-    point between two blocks is interpolated from both."""
+    """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first;
+    ``size`` is (height, width) of the image. A block counts whose bounding sphere, a voxel wider on each side for
+    interpolation, touches the frustum."""
     side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     p = ((keys + 0.5) * side - camera.t) @ camera.R
     z = p[:, 2]
@@ -147,8 +144,7 @@ def _collect_block_keys(
     keys: Int64,
     counts: Int64,
 ) -> None:
-    """Packed keys of the blocks of each of the ``bands`` that an image is cut into.
-
-    ``slots`` (bands, 2 * capacity) of -1 is scratch, a hash set; ``keys`` (bands, capacity) are filled in no order,
-    each once; ``counts`` (bands,) are more than the capacity, a power of two, where there is no room for all."""
+    """Packed keys of the blocks of each of the ``bands`` of an image, each once, in no order: ``keys`` (bands,
+    capacity), ``counts`` (bands,), which are more than the capacity, a power of two, where there is no room for all.
+    ``slots`` (bands, 2 * capacity) of -1 is scratch, a hash set."""
     ...

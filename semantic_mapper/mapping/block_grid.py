@@ -1,8 +1,7 @@
 """Storage of the map: sparse voxel blocks in one pool of memory, with one index, and growth in bounded steps.
 
 With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
-bit, when they are requested. What brings blocks in raises ``MapError`` where the map would exceed ``max_blocks``, or
-the disk fails.
+bit, when they are requested; ``MapError`` where the map would exceed ``max_blocks``, or the disk fails.
 
 A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point ``(8 * (x, y, z)
 + (i, j, k)) * voxel_size_m`` in the world."""
@@ -71,9 +70,8 @@ class GridBuffers(NamedTuple):
 class BlockGrid:
     """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``, in memory and on disk.
 
-    ``classes`` L are the channels of evidence, ``initial_blocks`` the capacity at start, ``memory_bytes`` those of
-    blocks in memory, 0 = no limit. ``watchers`` are called with the packed keys that ``activate`` gets, before it does
-    anything."""
+    ``classes`` L are the channels of evidence, ``memory_bytes`` the limit of blocks in memory, 0 = none. ``watchers``
+    are called with the packed keys that ``activate`` gets, before it does anything."""
 
     def __init__(
         self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int, memory_bytes: int = 0
@@ -166,10 +164,8 @@ class BlockGrid:
         return keys[np.argsort(pack_keys(keys))]
 
     def activate(self, packed: Int64) -> Int32:
-        """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
-
-        New ones are zero; those on disk come back as they were. They have to fit in memory; ``batches`` takes any
-        number. After an error no block has changed."""
+        """Make sure that blocks of unique packed keys (B,), about to change, are in memory, which has room for them;
+        returns indices (B,). New ones are zero. After an error no block has changed."""
         for watcher in self.watchers:
             watcher(packed)
         found = self._bring_together(packed)
@@ -177,9 +173,8 @@ class BlockGrid:
         return found
 
     def batches(self, packed: Int64) -> Iterator[Int32]:
-        """``activate`` unique packed keys (B,) this many at a time as memory has room for, checked as a whole first.
-
-        Yields buffer indices of a part of them, valid until the next; one empty part where there are no keys."""
+        """``activate`` unique packed keys (B,), as many at a time as memory has room for, checked as a whole first:
+        buffer indices of a part of them, valid until the next; one empty part where there are no keys."""
         if len(packed) > self._max_resident:
             found = find_blocks(self._index, packed)
             self._check_room(packed[found < 0])
@@ -241,9 +236,8 @@ class BlockGrid:
         return packed[newer], versions[newer]
 
     def tiles(self) -> Iterator[tuple[Int32, Int32, BlockGrid]]:
-        """All blocks, in lexicographic order, in parts that fit in memory: keys (B, 3), their buffer indices (B,) in a
-        grid, and that grid: this one where nothing is on disk, else a temporary one, which also holds the next
-        blocks along each axis."""
+        """All blocks, in lexicographic order, in parts: keys (B, 3), their buffer indices (B,) in a grid, and that
+        grid, which also holds the next blocks along each axis; see ``holding``."""
         everything = self.all_packed()
         for start in range(0, max(len(everything), 1), TILE_BLOCKS):
             part = everything[start : start + TILE_BLOCKS]
@@ -271,8 +265,8 @@ class BlockGrid:
         return values
 
     def pack(self, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
-        """A packed copy of blocks (B,) that exist, part by part, first those in memory: positions in ``packed`` (P,),
-        and the blocks there."""
+        """A packed copy of existing blocks (B,), part by part, first those in memory: positions in ``packed`` (P,), and
+        blocks."""
         found = find_blocks(self._index, packed)
         here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
         yield here, pack_blocks(self._buffers.values, found[here])

@@ -2,11 +2,7 @@
 
 A block key is the block's integer coordinate (x, y, z); three of them packed into one int64 sort like the triple. The
 index is an open-addressing table that compiled kernels can read (``block_index.h``). On disk is scratch space of one
-running process.
-
-SQLite takes its file out of the folder as soon as it is open, so nothing stays behind, however the process ends. Each
-blob has a checksum. A write that fails is taken back: what was there before is there still.
-"""
+process: SQLite unlinks its file as soon as it is open. A write that fails is taken back."""
 
 from __future__ import annotations
 
@@ -114,10 +110,9 @@ class PackedBlocks(NamedTuple):
 
 
 class ScratchFile:
-    """Blobs by an integer key. Calls may come from several threads, one at a time. What fails is a ``MapError``: no
-    file can be made in the system's folder for temporary files, the disk is full (then the file is as it was, and
-    can be used again once there is room), or a blob is not what was put there. ``what`` the blobs are and ``advice``
-    are for messages."""
+    """Blobs by an integer key, each with a checksum, for one thread at a time. What fails is a ``MapError``: no file
+    can be made in the folder for temporary files, the disk is full (the file is as it was, and works again once there
+    is room), or a blob is damaged. ``what`` the blobs are and ``advice`` are for messages."""
 
     def __init__(self, what: str, advice: str) -> None:
         self._what, self._advice = what, advice
@@ -180,10 +175,8 @@ class ScratchFile:
 
 
 class BlockStore:
-    """Blocks on disk by packed key: ``keys`` (B,), ascending; when each had last changed, and whether it holds a
-    surface.
-
-    What fails is a ``MapError`` of ``ScratchFile``, and the store is as it was."""
+    """Blocks on disk by packed key: ``keys`` (B,), ascending; when each last changed, and whether it holds a surface.
+    After a ``MapError`` the store is as it was."""
 
     def __init__(self) -> None:
         self.keys = np.empty(0, np.int64)

@@ -1,8 +1,7 @@
 """What changed in a map since a version, small enough to be sent: 3.1 KB a block instead of 12 KB and 2 KB a class.
 
-The TSDF is rounded to 1/127 of the truncation (0.6 mm at 2 cm voxels) without ever changing its sign, so that the
-surface stays between the same voxels. Class evidence is decided where it lies: one class and its probability a voxel.
-"""
+The TSDF is rounded to 1/127 of the truncation without ever changing its sign, so that the surface stays between the
+same voxels. Class evidence is decided where it lies: one class and its probability a voxel."""
 
 from __future__ import annotations
 
@@ -121,8 +120,8 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
 
 
 def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the changed blocks (B,) come first: positions, ascending, of whole versions, at least one, and else at
-    most ``limit`` blocks (0 = all); and the version that they complete. ``newest`` is the map's."""
+    """Which of the changed blocks (B,) come first: ascending positions of whole versions, at least one, else at most
+    ``limit`` blocks (0 = all); and the version that they complete, ``newest`` where it is all."""
     if not limit or len(versions) <= limit:
         return np.arange(len(versions)), newest
     distinct, counts = np.unique(versions, return_counts=True)

@@ -2,19 +2,17 @@
 
 A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
 measured, of the eight around at most ``MOST_HOLES`` are not, and all that is measured in its surroundings lies well
-behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``,
-``ASIDE_PER_M``), so that thin things, depth edges and grazing views are safe; the margin grows with the voxels and with
-the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). Nothing is cleared by a pixel without depth or farther than
-``depth_max`` (black and shiny things return nothing), as near to the edge of the image as a pose may be off, or of
-computed or rendered depth: where pictures are matched wrongly, that lies far behind, frame after frame.
+behind it. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin
+things, depth edges and grazing views are safe; the margin grows with voxels and depth (``MARGIN_VOXELS``,
+``MARGIN_PER_M``). Pixels without depth, beyond ``depth_max``, near the edge of the image, or of computed depth clear
+nothing.
 
-Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
-less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
-clear any surface, and one is enough for what a single frame saw, or for what was only computed. What is seen through in
-every second frame or less, as by mirrors, stays. The state of this is the weight alone.
+Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most. Where less than one measurement is
+left, the voxel becomes free and loses its votes: three frames clear any surface, one what a single frame saw. What is
+seen through in every second frame or less, as by mirrors, stays.
 
-The blocks of the truncation band are fused anyway, and cleared in that pass (``fusion.c``). This module finds and
-clears the others that are in view. Its numbers stand in ``see_through.h``, too."""
+Blocks of the truncation band are cleared while they are fused (``fusion.c``). This module clears the others in view.
+Its numbers stand in ``see_through.h``, too."""
 
 from __future__ import annotations
 
@@ -59,10 +57,8 @@ class Scene(NamedTuple):
 
 
 class DepthBounds(NamedTuple):
-    """Least and greatest depth of parts of an image that is cut into square cells, for any square at once.
-
-    The least depth of a square of pixels is the least of four entries, whatever its size: those of the largest square
-    of 2^level cells a side that fits, put into each of its corners."""
+    """Least and greatest depth of parts of an image that is cut into square cells, for any square at once: the least of
+    a square of pixels is that of the largest 2^level squares that fit, put into each of its corners."""
 
     # (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no depth. No
     # levels: nothing is to be cleared.
@@ -75,10 +71,8 @@ NO_BOUNDS = DepthBounds(np.empty((0, 0, 0), np.float32), np.empty((0, 0), np.flo
 
 
 def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BOUNDS) -> DepthBounds:
-    """Bounds of depth (H, W) in metres; what is farther than ``depth_max_m`` is not measured.
-
-    They take the memory of ``before``, which nobody looks at any more, where the size is the same: new memory of 2 MB
-    costs as much as filling it."""
+    """Bounds of depth (H, W) in metres; beyond ``depth_max_m`` nothing is measured. They take the memory of ``before``,
+    which nobody uses any more, where the size is the same: new memory of 2 MB costs as much as filling it."""
     cell = max(1, max(depth.shape) // _CELLS)
     h, w = depth.shape[0] // cell, depth.shape[1] // cell
     bounds = before
@@ -92,19 +86,9 @@ def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BO
 def clear_in_view(
     grid: BlockGrid, band: Int64, scene: Scene, bounds: DepthBounds, version: int
 ) -> Iterator[tuple[Int64, Int64]]:
-    """Clear what a frame sees through outside of the truncation band, in place; hold the map's lock meanwhile.
-
-    Blocks on disk come back where the frame may see through them.
-
-    Args:
-        band: (B,) sorted packed keys of the blocks that the frame was fused into.
-        scene: Its depth is a sensor's.
-        bounds: Of the depth.
-        version: Of the map, for the blocks that change.
-
-    Yields:
-        Packed keys (B,) of blocks that have changed, and how many of their voxels were cleared (B,).
-    """
+    """Clear what a frame with a sensor's depth sees through outside of the truncation ``band`` (B,), sorted packed
+    keys, in place, under the map's lock: packed keys (B,) of blocks that changed, which get ``version``, and voxels
+    cleared in each."""
     packed = _candidates(grid, band, scene, bounds)
     for start in range(0, len(packed), grid.room):
         part = packed[start : start + grid.room]

@@ -1,18 +1,16 @@
 """Corrected poses of frames, as a loop closure gives them, and the map that follows them.
 
-A pose graph gives new poses for its keyframes alone. A frame between two of them in time moves with both: with C_a and
-C_b the motions ``T_new @ T_old^-1`` of its neighbours and s the part of the time between them, its rotation is turned
-by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``: blended
-translations would be off by (turn)^2 / 8 times the distance to the world's origin. A frame before the first given one
-moves with the first. A frame after the last moves with it only where the caller says so (``until_ns``).
+A frame between two given ones in time moves with both: with C_a and C_b the motions ``T_new @ T_old^-1`` of its
+neighbours and s the part of the time between them, its rotation turns by slerp, and its position p goes to ``(1 - s)
+C_a p + s C_b p``: blended translations would be off by (turn)^2 / 8 times the distance to the world's origin. A frame
+before the first given one moves with the first, one after the last only up to ``until_ns``.
 
-The map is built again from a snapshot of itself and the frames that were fused since, which are kept on disk, lossless:
-with the same poses it is the same map, bit for bit. The rebuild goes on in batches, between steps or from another
-thread, next to the map in use, which it replaces once it has caught up. Class probabilities are not rendered again: a
-correction changes where frames near in time are relative to each other far less than where all are in the world.
+The map is built again from a snapshot of itself and the frames that were fused since, kept on disk, lossless: with the
+same poses it is the same map, bit for bit. The rebuild goes on in batches, between steps or from another thread, next
+to the map in use, which it replaces once it has caught up. Class probabilities are not rendered again.
 
 Frames are kept in two halves of ``history.max_frames`` each. When the newer one is full, the older one leaves, and the
-snapshot that was made between them is the one that rebuilds begin with. So corrections reach at least one half back."""
+snapshot between them is the one that rebuilds begin with. So corrections reach at least one half back."""
 
 from __future__ import annotations
 
@@ -55,11 +53,10 @@ class PosePair(NamedTuple):
 
 
 class PoseCorrection:
-    """How a correction moves frames. All cameras are taken to sit on one body: they follow the same motion in time.
+    """How a correction moves frames. All cameras sit on one body; each frame moves with given poses of its own world.
 
-    A frame moves with given poses of its own world alone. Where several cameras have the same stamp, the first by name
-    speaks for the others. Frames later than the last pair, up to ``until_ns``, move with the last pair; ``ALWAYS``: all
-    of them, those to come as well."""
+    Where several cameras have the same stamp, the first by name speaks for the others. Frames later than the last pair,
+    up to ``until_ns``, move with it; ``ALWAYS``: those to come as well."""
 
     def __init__(self, pairs: Sequence[PosePair], until_ns: int) -> None:
         self.until_ns = until_ns
@@ -148,14 +145,10 @@ class _Rebuild:
 class MapCorrector:
     """The history of a map, and the rebuild that is under way, if one is. Safe to call from several threads.
 
-    ``lock`` is held by a step, by a frame of a rebuild, and where the maps are exchanged: one at a time.
-
-    Args:
-        config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
-        voxel_map, keyframes: In use; move with their frames at the end of a rebuild.
-        fuse: Integrates a frame of the history and its rendered view (h, w) into the map given.
-        on_move: Called when a correction begins, and when the map has moved.
-    """
+    ``lock`` is held by a step, by a frame of a rebuild, and where the maps are exchanged. ``voxel_map`` and
+    ``keyframes`` move with their frames at the end of a rebuild. ``fuse`` integrates a frame of the history and its
+    rendered view (h, w) into the map given; ``on_move`` is called when a correction begins, and when the map has
+    moved."""
 
     def __init__(
         self,
@@ -222,9 +215,8 @@ class MapCorrector:
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def make_room(self) -> None:
-        """Make a snapshot where a half of the history is full, before a step.
-
-        During a rebuild, which may still need all frames, none leaves, but the step continues it, so that it ends."""
+        """Make a snapshot where a half of the history is full, before a step. During a rebuild, which may need all
+        frames, none leaves, but the step continues it, so that it ends."""
         if self._scratch is None:
             return
         try:
@@ -256,8 +248,8 @@ class MapCorrector:
         self._snapshots.append(self._map.snapshot())
 
     def record(self, frame: PosedFrame, view: RenderedView) -> None:
-        """Keep a frame that the map was just given, without the depth that was left out, and its view before it was
-        upsampled. Where the disk fails, mapping goes on and correcting ends."""
+        """Keep a frame that the map was just given, without the depth that was left out, and its view before
+        upsampling. Where the disk fails, mapping goes on and correcting ends."""
         if self._scratch is None:
             return
         blob = _pack((view.probabilities, view.known, view.depth_m, frame.rgb, frame.depth_m, frame.depth_sigma_m))
@@ -274,17 +266,15 @@ class MapCorrector:
     def start(self, poses: CorrectedPoses, until_ns: int | None = None) -> CorrectionStatus:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
 
-        The map in use stays as it is until ``advance`` has brought the rebuild to its end. A call during a rebuild
-        begins it again, with this correction upon the one under way: the outcome is that of two in a row. Raises
-        MapError: no history is kept, a stamp is of no frame, or all given frames have left it. Nothing has changed.
-        PoseError: a pose is not a rigid transform.
+        The map in use stays until ``advance`` has brought the rebuild to its end. A call during a rebuild begins it
+        again, with both corrections in a row. ``MapError``: no history is kept, a stamp is of no frame, or all given
+        frames have left it; ``PoseError``: no rigid transform. Nothing has changed then.
 
         Args:
-            poses: In the map's world as it is right from now on, at least one. Frames between them in time move as the
-                head of this file says. Frames that have left the history stay where they are.
+            poses: In the map's world as it is right from now on, at least one; see the head of this file.
             until_ns: Frames later than the last given one, up to this stamp, have come in the old world and move with
-                it. By default none have. ``ALWAYS``: odometry goes on in the old world, and frames to come move, too.
-        """
+                it. By default none have. ``ALWAYS``: odometry goes on in the old world, and frames to come move,
+                too."""
         with self.lock:
             if self._scratch is None:
                 raise MapError(f"poses cannot be corrected: {self._why_none}")
@@ -301,8 +291,7 @@ class MapCorrector:
 
     def advance(self, max_frames: int = 1) -> bool:
         """Continue a rebuild by this many frames, from any thread, and exchange the maps where it has caught up;
-        whether it still runs. ``MapError``: the corrected map cannot be built (too large, or a frame out of reach of
-        any voxel, say); the correction is given up, the map in use stays as it is."""
+        whether it still runs. ``MapError``: the corrected map cannot be built; it is given up, the map in use stays."""
         for _ in range(max_frames):
             with self.lock:  # let go after every frame: a step may wait for it
                 rebuild = self._rebuild

@@ -111,19 +111,16 @@ def occupancy_grid(
     floor_m: float | None = None,
     cost_of: NDArray[np.int64] | None = None,
 ) -> OccupancyGrid:
-    """Make the plan of a map's surface points; see the head of this file for what its values mean.
-
-    Raises MapError: impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
+    """Make the plan of a map's surface points; see the head of this file for what its values mean. ``MapError``:
+    impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
 
     Args:
         up: (3,) unit vector, up in the world.
         resolution_m: Side of a cell; below the map's voxel size, walls would have holes.
         height_m: LOW and HIGH above the floor, 0 < LOW < HIGH.
         floor_m: Height of the floor, along ``up`` from the origin of the world; None = found by ``floor_height``.
-        cost_of: (256,) cost of each class id, 0 to 100, -1 where a class has none of its own; None makes no ``costs``.
-            A cell costs as much as the dearest surface in it between -LOW and HIGH. Surface without a cost of its own
-            costs 100 where it is above LOW, and nothing where it is floor.
-    """
+        cost_of: (256,) cost of each class id, 0 to 100, -1 = none of its own; None makes no ``costs``. A cell costs as
+            much as the dearest surface in it; surface without a cost of its own 100 above LOW, and nothing as floor."""
     low, high = height_m
     if not (0 < low < high and np.isfinite(high)):
         raise MapError(f"height band {low:g} to {high:g} m: LOW must be above 0 and below HIGH")
@@ -175,9 +172,9 @@ def floor_height(height: Float64) -> float:
 def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
     """Write the YAML and, next to it, the PGM of the same stem; of a grid with costs, these as ``STEM_costs``, too.
 
-    The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
-    pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
-    Returns the files; ``MapError`` where one cannot be written."""
+    The picture's first row is the grid's last one; ``origin`` is the outer corner of the lower left pixel.
+    ``T_grid_world``, which map servers pass over, takes points of the world to the plan. Returns the files;
+    ``MapError``: one cannot be written."""
     grey = np.full(grid.cells.shape, _UNKNOWN_GREY, np.uint8)
     grey[grid.cells == FREE] = _FREE_GREY
     grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY

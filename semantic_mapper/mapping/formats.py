@@ -1,14 +1,12 @@
-"""A map as files of other programs: PLY, OBJ and GLB (surface), NPZ (points), PGM and YAML (floor plan).
+"""A map as files of other programs: PLY, OBJ and GLB (surface), NPZ (points).
 
 Files hold the world frame, in metres unless they say "scale: unknown"; one that cannot be written is a ``MapError``. Of
-PLY, ``comment label 3 chair`` says what the id 3 of the property ``label`` means; names are ASCII with Python's
-escapes, which ``name.encode().decode("unicode_escape")`` reads. Where depth was computed somewhere, PLY and NPZ have
-``measured``: 0 there, 1 where a sensor measured the surface.
+PLY, ``comment label 3 chair`` says what the id 3 of ``label`` means; names are ASCII with Python's escapes. Where depth
+was computed somewhere, PLY and NPZ have ``measured``: 0 there, 1 where a sensor measured the surface.
 
-GLB (glTF 2.0) is right-handed with y up. Vertices keep the coordinates of the world; the mesh's node holds the rotation
-that takes the world's up to +y. Vertex attributes: POSITION; COLOR_0 (linear light, as glTF asks, 16 bits so that
-sRGB's 8 survive); _LABEL (uint8 class id, each padded to four bytes as glTF asks); _CONFIDENCE (float).
-``extras.label_set`` of the mesh says what the ids mean."""
+GLB (glTF 2.0) has y up: the mesh's node holds the rotation, vertices keep the coordinates of the world. COLOR_0 is
+linear light, 16 bits so that sRGB's 8 survive; _LABEL is the uint8 class id, _CONFIDENCE a float; ``extras.label_set``
+of the mesh says what the ids mean."""
 
 from __future__ import annotations
 
@@ -117,10 +115,8 @@ _VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the
 
 
 def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
-    """Write a mesh with at least one face (glTF has no empty ones) as GLB; ``up`` (3,) is a unit vector, up in the
-    world.
-
-    ``MapError``: no faces, more than 4 GiB, or the file cannot be written."""
+    """Write a mesh as GLB; ``up`` (3,) is a unit vector, up in the world. ``MapError``: no faces, which glTF cannot
+    hold, or more than 4 GiB."""
     if not len(mesh.faces):
         raise MapError(f"{path}: glTF cannot hold a mesh without faces")
     labels = np.zeros((len(mesh.label), 4), np.uint8)

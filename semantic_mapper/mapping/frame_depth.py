@@ -71,9 +71,8 @@ class FrameDepth:
     def push(self, frame: PosedFrame) -> list[PosedFrame]:
         """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
 
-        A frame that has a spread of its depth, as it was here before or as its log has it, is left as it is; with
-        ``source`` "sensor" or "off" its depth is left out. ``FrameError``: a picture that would spoil the map; see
-        ``PictureCheck``."""
+        A frame with a spread of its depth is left as it is; with ``source`` "sensor" or "off" its depth is left out.
+        ``FrameError``: a picture that would spoil the map; see ``PictureCheck``."""
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
         if frame.depth_sigma_m is not None:
@@ -151,10 +150,9 @@ def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
 def rendered_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) -> Float32:
     """Fraction (h, w) of its full weight that depth has which a field rendered; 0 where there is nothing to fuse.
 
-    It is a mean along each ray: where its samples disagree, at edges and where it guesses, it leaves the smooth surface
-    of its neighbours; and where the map has a surface, it has to lie near that. So trust falls with both differences:
-    to 1 / e half a truncation away from the map's surface. Beyond the map a field mostly guesses: there many looks have
-    to agree. Depths are 0 where nothing is known."""
+    It is a mean along each ray: at edges and where samples disagree it leaves the smooth surface of its neighbours, and
+    it has to lie near the map's surface. Trust falls with both differences, to 1 / e half a truncation away. Beyond the
+    map a field mostly guesses: there many looks have to agree. Depths are 0 where nothing is known."""
     roughness = np.maximum(_bend(depth_m, 0), _bend(depth_m, 1)) / np.maximum(depth_m, np.float32(1e-3))
     cost = (roughness / ROUGHNESS) ** 2
     off = 2 * (depth_m - map_depth_m) / truncation_m

@@ -1,14 +1,12 @@
 """Fusion of one frame in one compiled pass over the blocks it touches: TSDF, colour and class evidence together.
 
 TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the sum over frames of ``w * log p``
-at the pixel a voxel projects to: one vote a voxel a frame, only near the surface, where the field knows. ``w`` (0..1)
-trusts near and frontal looks more; see ``make_votes``.
+at the pixel a voxel projects to: one vote a voxel a frame, only near the surface. ``w`` (0..1) trusts near and frontal
+looks more; see ``make_votes``. The result does not depend on threads.
 
-Depth of a sensor weighs ``MEASURED`` in the TSDF. Computed depth (from the pictures, or rendered by a field) weighs at
-most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so the weight of a voxel says whether its
-surface was measured (from ``MEASURED`` on). Computed depth never changes what was measured.
-
-The kernels (``fusion.c``) depend on no order among threads, so a frame gives the same bits every time."""
+Depth of a sensor weighs ``MEASURED`` in the TSDF; computed depth at most ``COMPUTED_LOOK``, and all of it together at
+most ``COMPUTED_CAP``: so the weight of a voxel says whether its surface was measured. Computed depth never changes what
+was measured."""
 
 from __future__ import annotations
 
@@ -33,7 +31,6 @@ SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surfa
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
-ProbabilityTable = tuple[Float32, Int32]  # probabilities (K, L), row of each pixel (H, W), -1 = unknown
 
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
     "voxel_size_m": (1e-4, 10.0),
@@ -68,16 +65,9 @@ class Votes(NamedTuple):
 def make_votes(
     probabilities: Float32, rows: Int32, depth: Float32, camera: Camera, depth_max: float
 ) -> tuple[Votes, int]:
-    """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due.
-
-    Args:
-        probabilities: (K, L) float32, each row that is referred to summing to 1.
-        rows: (H, W) int32 row of each pixel, -1 = unknown.
-        depth: (H, W) float32 metres.
-
-    Returns:
-        The votes, and how many known pixels hold probabilities that are not finite, negative or do not sum to 1.
-    """
+    """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due; and how many known
+    pixels hold what is no probability. Rows of ``probabilities`` (K, L) by pixel: ``rows`` (H, W) int32, -1 = unknown;
+    ``depth`` (H, W) in metres."""
     log_p, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
     _log_probability_rows(len(probabilities), probabilities, log_p, proper)
     weights, bad = np.empty(depth.shape, np.float32), np.empty(len(depth), np.int64)
@@ -101,12 +91,20 @@ def checked_depth(
     return np.where(trust > 0, depth_m, np.float32(0)), np.ascontiguousarray(trust)
 
 
-def probability_table(
-    depth: Float32, probabilities: Float32, known: Bool | None, rows: Int32 | None, classes: int, where: str
-) -> ProbabilityTable:
-    """Class probabilities and the row of each pixel, however they were given; see ``VoxelMap.integrate``.
-
-    ``ShapeError``: something does not fit the depth (H, W), or is of another dtype."""
+def frame_votes(
+    depth: Float32,
+    probabilities: Float32,
+    known: Bool | None,
+    rows: Int32 | None,
+    trust: Float32,
+    camera: Camera,
+    depth_max_m: float,
+    classes: int,
+    where: str,
+) -> Votes:
+    """Votes of a frame, however its probabilities were given (``VoxelMap.integrate``); each weighs what the depth under
+    it does, where ``trust`` says so. ``ShapeError``: something does not fit the depth (H, W), or is of another dtype;
+    ``FrameError``: invalid probabilities."""
     size = f"{depth.shape[0]} {depth.shape[1]}"
     if rows is None:
         _expect(probabilities, f"{size} {classes}", np.float32, f"{where}: probabilities")
@@ -119,27 +117,11 @@ def probability_table(
         _expect(rows, size, np.int32, f"{where}: rows")
         if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
             raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
-    return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
-
-
-def frame_votes(
-    depth: Float32,
-    table: ProbabilityTable | None,
-    camera: Camera,
-    depth_max_m: float,
-    classes: int,
-    where: str,
-    trust: Float32 | None = None,
-) -> Votes:
-    """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
-
-    ``FrameError``: invalid probabilities."""
-    if table is None:
-        return Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
-    votes, bad = make_votes(*table, depth, camera, depth_max_m)
+    table = np.ascontiguousarray(probabilities).reshape(-1, classes)
+    votes, bad = make_votes(table, np.ascontiguousarray(rows), depth, camera, depth_max_m)
     if bad:
         raise FrameError(f"{where}: probabilities of {bad} known pixels are NaN, negative or do not sum to 1")
-    return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
+    return votes._replace(weights=votes.weights * trust) if trust.size else votes
 
 
 def _expect(array: NDArray[np.generic], shape: str, dtype: type[np.generic], name: str) -> None:
@@ -160,11 +142,8 @@ def fuse_blocks(
 ) -> Int64:
     """Fuse one frame into blocks (B,), each once, in place; returns how many surface voxels of each were cleared (B,).
 
-    Args:
-        trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
-        measured: Whether a sensor measured the depth.
-        bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
-    """
+    ``trust`` (H, W) float32 is the fraction of its weight that each depth counts, or (0, 0): 1. ``bounds`` are of the
+    depth, where what the frame sees through is to be cleared; see ``clearing``."""
     cleared = np.empty(len(indices), np.int64)
     look, cap = (MEASURED, scene.limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
     _fuse_frame_into_blocks(len(indices), indices, buffers, scene, trust, votes, look, cap, bounds, cleared)
@@ -188,10 +167,8 @@ def _vote_weights(
     weights: Float32,
     bad: Int64,
 ) -> None:
-    """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
-
-    ``proper`` (K,) is of ``_log_probability_rows``; ``bad`` (H,) is filled with the known pixels of each row of the
-    image whose probabilities are not proper."""
+    """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness;
+    ``bad`` (H,) counts known pixels of each image row whose row of the table is not ``proper`` (K,)."""
     ...
 
 

@@ -98,11 +98,11 @@ class KeyframeStore:
         count: int,
         size: EncodedSize | None = None,
     ) -> list[Keyframe]:
-        """Up to ``count`` keyframes that together cover the query frustum; none that see nothing of it.
+        """Up to ``count`` keyframes, of views of ``size``, that together cover the query frustum; none that see nothing
+        of it.
 
         Greedy: each pick adds most not yet covered points of the query's own surface (its depth, or points at a few
-        depths where it has none). Visibility is tested against the keyframes' depth. ``size``: only those whose encoded
-        view is of it."""
+        depths where it has none). Visibility is tested against the keyframes' depth."""
         fitting = [k for k in self._keyframes if size in (None, k.encoded.size)]
         if not fitting or count <= 0:
             return []
@@ -121,7 +121,7 @@ class KeyframeStore:
 
     def _drop_most_redundant(self) -> bool:
         """Drop the one nearest to another; False where all have to stay. What the camera has left behind counts as
-        nearer: else a long walk would thin out its few keyframes evenly, and leave no source views where it is."""
+        nearer: else a long walk would leave no source views where it is."""
         poses = self._poses()
         spacing = _separations(poses[:, None], poses[None])
         np.fill_diagonal(spacing, np.inf)

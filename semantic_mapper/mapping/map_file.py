@@ -1,12 +1,9 @@
 """The map on disk: ``map.npz``, a zip of compressed .npy arrays in chunks of blocks, and ``manifest.json``.
 
-``numpy.load`` opens it: array ``tsdf`` of the first chunk is ``"000000/tsdf"``. Only voxels that hold something are
-stored: TSDF, weight and colour where there was a measurement, evidence and votes where there was a vote. Blocks stand
-in lexicographic order, and nothing in the file depends on when or where it was written: the same map gives the same
-bytes. The manifest holds the settings, the classes, and a SHA-256 of each chunk; its own is the comment of the zip.
-
-Writing and reading take memory for one chunk, whatever the size of the map.
-"""
+``numpy.load`` opens it: array ``tsdf`` of the first chunk is ``"000000/tsdf"``. TSDF, weight and colour are stored
+where there was a measurement, evidence and votes where there was a vote. Blocks stand in lexicographic order, and the
+same map gives the same bytes. The manifest holds settings, classes, and a SHA-256 of each chunk; its own is the comment
+of the zip. Writing and reading take memory for one chunk."""
 
 from __future__ import annotations
 
@@ -143,10 +140,9 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
 def write_map(
     path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = ()
 ) -> MapManifest:
-    """Write a map, replacing a file of that name in one step; returns the manifest as written, with what depends on the
-    blocks filled in. ``parts`` are blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest;
-    ``places`` are what the map is found again by. ``MapError``: it cannot be written; a file that was there before
-    is untouched."""
+    """Write a map in one step; returns the manifest with what depends on the blocks filled in. ``parts`` are blocks in
+    lexicographic order, ``CHUNK_BLOCKS`` at a time. ``MapError``: it cannot be written; a file from before is
+    untouched."""
     chunks: list[MapChunk] = []
     corners: list[Int32] = []
     try:
@@ -176,8 +172,7 @@ def write_map(
 
 
 def describe_map(path: Path) -> MapManifest:
-    """What a saved map says of itself, without its blocks; ``MapError`` where it is missing, damaged or of another
-    format."""
+    """What a saved map says of itself, without its blocks; ``MapError``: missing, damaged or of another format."""
     with open_map(path) as reader:
         return reader.manifest
 
@@ -199,10 +194,7 @@ def open_map(path: Path) -> Iterator[MapReader]:
 
 
 class MapReader:
-    """A saved map that is open; ``manifest`` is checked.
-
-    ``digest`` is the SHA-256 of the manifest as it stands in the file: that of the map, as it holds those of all
-    chunks."""
+    """A saved map that is open; ``manifest`` is checked, ``digest`` is its SHA-256 and so that of the map."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, manifest: MapManifest) -> None:
         self.manifest = manifest

@@ -41,9 +41,9 @@ class FrozenMap:
         grid.watchers.append(self._copy)
 
     def write(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
-        """Write a map file, whole or not at all, in memory for ``CHUNK_BLOCKS``; closes this. ``between`` is called
-        after each of them, without the lock; an error of its own ends the writing. ``MapError``: the file cannot be
-        written, or the disk fails; a file that was there before is as it was."""
+        """Write a map file, whole or not at all; closes this. ``between`` is called after each ``CHUNK_BLOCKS``,
+        without the lock; an error of its own ends the writing. ``MapError``: it cannot be written, or the disk fails; a
+        file that was there is as it was."""
         try:
             manifest = write_map(path, self.manifest, self.parts(between, last=True), self.places)
         finally:

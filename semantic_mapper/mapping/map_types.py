@@ -1,8 +1,7 @@
 """What a map gives out, and whether its lengths are metres: plain data.
 
-A map of poses from pictures alone has a unit of its own (``VoxelMap.scale_known``). Snapshots, answers and files of it
-say so. What asks for metres, or states them, asks here first (``require_metres``); pictures, classes and counts go on.
-"""
+A map of poses from pictures alone has a unit of its own (``VoxelMap.scale_known``). What asks for metres, or states
+them, asks here first (``require_metres``); pictures, classes and counts go on."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
 """Adding the voxels of one map to another: sums of what both have measured, resampled where their voxels differ.
 
-Two maps with the same voxels add up: weights, evidence and votes are sums, TSDF and colour are means by weight; the
-caps are those of fusion, except that where votes pass theirs, old and new fade alike, since neither map is the older.
-Maps whose voxels do not coincide are interpolated first, between the eight voxels around each new one, over those that
-were observed and only where these outweigh the others. Across a depth edge the nearest voxel is taken: in between there
-would be a surface that nobody saw."""
+Weights, evidence and votes are sums, TSDF and colour means by weight; the caps are those of fusion, except that where
+votes pass theirs, old and new fade alike. Maps whose voxels do not coincide are interpolated first, between the eight
+voxels around each new one, over those that were observed and only where these outweigh the others. Across a depth edge
+the nearest voxel is taken: in between there would be a surface that nobody saw."""
 
 from __future__ import annotations
 
@@ -44,8 +43,7 @@ def voxel_transform(T_a_b: Float64, voxel_size_m: float) -> VoxelTransform:
 
 
 def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapConfig, labels_b: LabelSet) -> None:
-    """Refuse maps of another voxel size or other classes (their colours and the set's name do not matter):
-    ``MapError``."""
+    """Refuse maps of another voxel size or other classes (colours and name do not matter): ``MapError``."""
     if config_a.voxel_size_m != config_b.voxel_size_m:
         sizes = f"{config_a.voxel_size_m:g} and {config_b.voxel_size_m:g}"
         raise MapError(f"maps of different voxel_map.voxel_size_m ({sizes}) cannot be merged; make one of them again")
@@ -59,10 +57,8 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
 
 
 def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTransform, cap: float, version: int) -> None:
-    """Add all that ``source`` holds to ``target``, a grid of the same voxels and classes; blocks without a measurement
-    are left out. ``cap`` is of weights and of votes, ``version`` that of the blocks that change.
-
-    Works on ``MERGED_AT_ONCE`` blocks of the target at a time."""
+    """Add all that ``source`` has measured to ``target``, a grid of the same voxels and classes, ``MERGED_AT_ONCE``
+    blocks at a time. ``cap`` is of weights and of votes, ``version`` that of the blocks that change."""
     R_source_target = np.ascontiguousarray(T_target_source.R.T)
     for wanted, needed in _parts(overlaps(source.all_packed(), T_target_source)):
         grid = source.holding(needed)
@@ -119,7 +115,7 @@ def _parts(pairs: Int64) -> Iterator[tuple[Int64, Int64]]:
 def _resample_blocks(
     count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
 ) -> None:
-    """Interpolate a source at the voxels of other blocks (B, 3), whose point p is the source's ``R @ (p - t)`` in
+    """Interpolate a source at voxels of other blocks (B, 3): their point p is the source's ``R @ (p - t)`` in
     voxels."""
     ...
 

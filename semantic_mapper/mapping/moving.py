@@ -1,23 +1,21 @@
 """What moves is no surface: pixels where something is now that was free space a moment ago.
 
 After Schmid et al., *Dynablox* (2023), but free space is what the camera itself saw within the last ``SETTLED_S``
-seconds, kept as small depth images, and no layer of the map: where a view of that time looked past a point, something
-has come there. So a thing that stays becomes part of the map after this time, whatever it is, and memory is bounded.
+seconds, kept as small depth images: where such a view looked past a point, something has come there. A thing that stays
+becomes part of the map after this time.
 
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
-measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things and depth edges
-say nothing. A frame is first aligned with views of these seconds, as poses that are off by a few centimetres would look
-like motion. Where that does not fit, or what it changes leaps from frame to frame, the poses are wrong and nothing is
-found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows, cell by cell, along its own
-surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside, which it hid itself.
+measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``. A frame is first aligned with
+views of these seconds; where that does not fit, or what it changes leaps from frame to frame, the poses are wrong and
+nothing is found. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then grows along its own
+surface into cells where no view of ``SURE_S`` ago or older saw a surface.
 
-Not found: what moves away along the line of sight, what had moved before it was seen for the first time, and what is
-slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through it (``mapping/clearing.py``).
+Not found: what moves away along the line of sight, what had moved before it was first seen, and what is slower than the
+margin in ``SETTLED_S``. Such surface is cleared when frames see through it (``mapping/clearing.py``).
 
-Alignment is Gauss-Newton from point to plane on small depth images, with a prior that the given pose is right to within
-``SIGMA_M`` and ``SIGMA_RAD``: a pose that jitters or drifts is corrected, one that jumps is not, and ``misfit`` tells.
-Most of what moves is no part of it: it is farther from what was there than residuals that count. Wider ``CUTS`` correct
-more, and people who walk pull at the pose."""
+Alignment is Gauss-Newton from point to plane on small depth images, with a prior that the pose is right to within
+``SIGMA_M`` and ``SIGMA_RAD``: a pose that drifts is corrected, one that jumps is not, and ``misfit`` says so. Wider
+``CUTS`` correct more, and people who walk pull at the pose."""
 
 from __future__ import annotations
 

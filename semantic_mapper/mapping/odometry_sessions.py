@@ -1,9 +1,7 @@
 """Frames of other odometry sessions, brought into the map's world.
 
-A camera that tracks itself begins its world where it starts: after it was unplugged, or in another launch, its poses
-say nothing of where it is in the map. Its frames are held until several of them are found there
-(``localization.relocalizer``), each by itself, and agree with each other and with the camera's own motion between them.
-"""
+A camera that tracks itself begins its world where it starts. Its frames are held until several of them are found in the
+map (``localization.relocalizer``), each by itself, and agree with each other and with the camera's own motion."""
 
 from __future__ import annotations
 
@@ -47,15 +45,9 @@ class OdometrySessions:
     """Which odometry sessions are known in a map, and the search for those that are not.
 
     The map is that of ``pipeline``; classes of a frame have to agree with it, and its ``pose_in_map`` is given the pose
-    of every frame. While the map is being corrected, no world is looked for. With ``own_first`` the first world that
-    comes is the map's own, as in a map that begins empty.
-
-    Attributes:
-        known: T_map_world (4, 4) by world.
-        found: Sessions that were found.
-        refused: Looks at a frame that did not find it, by reason.
-        reason: Why the last frame was not found; empty where it was, or needs no search.
-    """
+    of every frame. While the map is being corrected, no world is looked for. With ``own_first`` the first world is the
+    map's own. ``known`` is T_map_world (4, 4) by world, ``found`` counts sessions, ``refused`` looks in vain by reason;
+    ``reason`` says why the last frame was not found."""
 
     def __init__(self, pipeline: MappingPipeline, *, own_first: bool = True) -> None:
         self._pipeline = pipeline

@@ -1,8 +1,5 @@
-"""The one file that imports Open3D, after it has made sure that the system libraries the wheel links can be found.
-
-The wheel links ``libusb-1.0``, ``libGL``, ``libEGL``, ``libX11`` and others without shipping them. Libraries loaded
-here with RTLD_GLOBAL satisfy it, so nothing has to be installed system-wide.
-"""
+"""The one file that imports Open3D. Its wheel links ``libusb-1.0``, ``libGL`` and others without shipping them; loaded
+here with RTLD_GLOBAL, they need not be installed system-wide."""
 
 from __future__ import annotations
 

@@ -1,11 +1,9 @@
 """Whether pictures can be mapped, and whether they and their poses contradict each other.
 
 Depth that is computed from pictures needs sharp pictures, poses that are theirs, and a lens that stays as it was
-calibrated. Corners are followed from picture to picture. Points found from corners and given poses are projected into
-the next pictures: where the corners are elsewhere, poses do not fit; where they are all farther from the centre by one
-factor, three times in a row, the focal length has changed. ``research.experiments.picture_faults`` measures how
-reliable this is. A rolling shutter is not detected: what it does to hand-held pictures is lost in the errors of poses.
-"""
+calibrated. Points found from corners and given poses are projected into the next pictures: where the corners are
+elsewhere, poses do not fit; where they are farther from the centre by one factor, three times in a row, the focal
+length has changed. A rolling shutter is not detected."""
 
 from __future__ import annotations
 

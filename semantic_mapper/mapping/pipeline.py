@@ -69,9 +69,7 @@ class MappingPipeline:
     Deterministic: same frames, config, field and thread count give the same map, bit for bit. ``anchors`` are labelled
     keyframes that the field was finetuned on: source views from the first frame on. ``corrector`` moves the map with
     corrected poses, ``frame_depth`` gives frames their depth, ``picture_check`` says what was wrong with pictures,
-    ``pose_in_map`` where the last frame of a session was. Raises WeightsError: the field renders other classes than the
-    map holds.
-    """
+    ``pose_in_map`` where the last frame was. ``WeightsError``: the field renders other classes than the map holds."""
 
     def __init__(
         self, config: MapperConfig, field: SemanticField, label_set: LabelSet, *, anchors: Sequence[PosedFrame] = ()
@@ -121,11 +119,11 @@ class MappingPipeline:
             return self._update(views.frame, view, full, sources, is_keyframe, touched)
 
     def prepare(self, frame: PosedFrame) -> list[PosedFrame]:
-        """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first. One frame
-        each, unless ``depth.from_motion.delay_frames`` lets frames wait for later ones.
+        """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first: one frame
+        each, unless ``depth.from_motion.delay_frames`` lets frames wait.
 
-        ``FrameError``: its picture cannot be mapped, such as a dark or blurred one; see ``picture_check``.
-        ``PoseError``: the pose is not a rigid transform."""
+        ``FrameError``: its picture cannot be mapped, such as a dark or blurred one. ``PoseError``: no rigid
+        transform."""
         return self.frame_depth.push(frame)
 
     def prepare_rest(self) -> list[PosedFrame]:
@@ -134,12 +132,10 @@ class MappingPipeline:
 
     def render_virtual_views(self, views: int = 1) -> tuple[VirtualView, ...]:
         """Render the map from where no camera stood, at most so many views of most gain, fuse what they say of classes,
-        and return them; fewer where no more are worth their time.
+        and return them; every view takes about the time of a frame.
 
-        For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
-        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and virtual views. The history
-        keeps frames alone: a correction of poses rebuilds the map without these votes, and all may be looked at again.
-        """
+        Nothing is measured: TSDF, colours and ``frames`` stay as they are. Deterministic, as part of the sequence of
+        steps. A correction of poses rebuilds the map without these votes, and all may be looked at again."""
         rendered: list[VirtualView] = []
         with self.corrector.lock:
             while len(rendered) < views and (view := self._render_virtual_view()) is not None:
@@ -156,9 +152,8 @@ class MappingPipeline:
         return self._make_keyframe(views, self._encode(views, channel), labelled=True)
 
     def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
-        """Go on with other weights, which encode as the present ones do; what is in the map stays, with its weight.
-        Anchors of ``encode_anchor`` take the place of those before. ``WeightsError``: it renders other classes;
-        nothing has changed."""
+        """Go on with other weights, which encode as the present ones do, and the anchors of ``encode_anchor`` in place
+        of those before; what is in the map stays. ``WeightsError``: it renders other classes; nothing has changed."""
         check_classes(field, self.label_set)
         self.field = self._renderer.field = field
         self.keyframes.exchange_labelled(anchors)
@@ -273,9 +268,8 @@ class MappingPipeline:
         return isinstance(self.field, LearnedField) and self.field.holds_scene
 
     def _depth_prior(self, views: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
-        """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast.
-
-        Nowhere, without a sensor, for a field that holds the scene: it knows better."""
+        """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast; nowhere,
+        without a sensor, for a field that holds the scene."""
         frame, depth = views.frame, views.depth(intrinsics)
         if self._holds_scene and not is_measured(frame):
             return np.zeros_like(depth)
@@ -326,8 +320,7 @@ class MappingPipeline:
         self._fuse(voxel_map, self._upsample(FrameViews(frame), view, voxel_map), view)
 
     def _keep_view(self, views: FrameViews, current: EncodedViews, sources: Sequence[Keyframe]) -> bool:
-        """Keep a frame as a source view, and as a place that the map is found again by, where it shows something new;
-        whether it became a source view."""
+        """Keep a frame as a source view (whether it became one), and as a place, where it shows something new."""
         frame = views.frame
         is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
         if is_keyframe:
@@ -439,13 +432,9 @@ class MappingPipeline:
 class FieldTrial:
     """A field that may take the place of a pipeline's, which goes on mapping meanwhile: looked at in small pieces.
 
-    Raises WeightsError: other classes than the map's, or more anchors than the pipeline keeps keyframes.
-
-    Args:
-        field: Encodes as the present one does, see ``fields.learned.encode_alike``.
-        anchors: Labelled keyframes that it was finetuned on.
-        frames: Mapped ones, in which it is compared with the map; none = it is not.
-    """
+    ``field`` encodes as the present one does (``fields.learned.encode_alike``); ``anchors`` are labelled keyframes that
+    it was finetuned on; in ``frames``, mapped ones, it is compared with the map. ``WeightsError``: other classes than
+    the map's, or more anchors than the pipeline keeps keyframes."""
 
     def __init__(
         self,

@@ -1,15 +1,13 @@
 """Whether poses, depth and intrinsics fit each other: overlapping keyframes have to measure the same surface.
 
-Each new keyframe's depth is carried into some earlier ones and theirs into it, and the two depths at a pixel are
-compared. The disagreement is the lower quartile of the relative differences, so that it stays small where a quarter of
-the pixels agree, whatever moves before the camera or is hidden in one of two views: 0.2 to 0.5 % in good recordings, 1
-% with depth as noisy as a stereo camera's, 4 to 15 % with inverted poses or camera axes of another convention.
+Each new keyframe's depth is carried into some earlier ones and theirs into it. The disagreement is the lower quartile
+of the relative differences, so that it stays small whatever moves or is hidden: 0.2 to 0.5 % in good recordings, 1 %
+with a stereo camera's noise, 4 to 15 % with inverted poses or camera axes of another convention.
 
-A pair contradicts itself where one sees through what the other measures, which nothing that is hidden can explain; in
-good recordings in at most 8 % of the pixels. Where the poses jump or drift, only the pairs across the jump do: a new
-keyframe is compared with the oldest of its neighbourhood, too, and a tenth of the pairs is enough for a warning. What
-moves is seen through as well, but between neighbours in time just as much: that is taken off. Smaller errors stay
-unnoticed: depth that is 20 % too large, a focal length that is 10 % too long, a drift of less than about 20 cm."""
+A pair contradicts itself where one sees through what the other measures: in good recordings in at most 8 % of the
+pixels. Where the poses jump or drift, only the pairs across the jump do: so the oldest of the neighbourhood are
+compared, too, and a tenth of the pairs is enough for a warning. What moves is seen through between neighbours in time
+as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 10 % too long, a drift of 20 cm."""
 
 from __future__ import annotations
 
@@ -66,11 +64,9 @@ _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
 
 
 class PoseCheck:
-    """Compares keyframes as they come; changes nothing. Depth beyond ``FAR`` times the map's range is not compared.
-
-    Of keyframes, ``compared`` overlap with earlier ones; ``worst`` and ``worst_contradicting`` are the largest
-    ``recent`` and ``contradicting`` so far. ``warning`` says what is wrong and how to fix it, empty where all is well;
-    it stays, as the map keeps what was fused."""
+    """Compares keyframes as they come; changes nothing. ``compared`` of them overlap with earlier ones; ``worst`` and
+    ``worst_contradicting`` are the largest ``recent`` and ``contradicting`` so far. ``warning`` says what is wrong and
+    how to fix it; it stays, as the map keeps what was fused."""
 
     def __init__(self, depth_max_m: float) -> None:
         self._limit_m = FAR * depth_max_m
@@ -89,15 +85,15 @@ class PoseCheck:
 
     @property
     def contradicting(self) -> float | None:
-        """Fraction of the newest pairs of keyframes of which one sees through what the other measures; None as long as
-        too few overlap."""
+        """Fraction of the newest pairs of which one sees through what the other measures; None while too few
+        overlap."""
         if self.compared < MIN_KEYFRAMES or len(self._pairs) < MIN_PAIRS:
             return None
         return float(np.mean(np.array(self._pairs) > SEEN_THROUGH))
 
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
-        """Compare a new keyframe with earlier ones: those ``sources`` that see most of what it sees, the best first,
-        and others of all ``keyframes``, oldest first."""
+        """Compare a new keyframe with ``sources``, which see most of what it sees, the best first, and others, oldest
+        first."""
         near = [k for k in sources if not k.labelled][:PARTNERS]
         if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in near):
             near.append(keyframes[-1])

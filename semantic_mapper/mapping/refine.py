@@ -91,18 +91,15 @@ def refine(
     by_name: bool = False,
     on_tile: Callable[[int, int], object] = lambda done, total: None,
 ) -> RefineReport:
-    """Refine a map in place; others may read it meanwhile, but not integrate.
-
-    Raises MapError: an empty map, one already refined, voxels over 6 cm, lengths that are not metres, or no up is
-    found. WeightsError: weights of other classes.
+    """Refine a map in place; others may read it meanwhile, but not integrate. ``MapError``: an empty map, one already
+    refined, voxels over 6 cm, lengths that are not metres, or no up is found; ``WeightsError``: weights of other
+    classes.
 
     Args:
-        weights: Of the same classes.
         fill: Surface without votes gets a class where it is at least so likely; 1 = never.
         up: (3,) in the world; None = away from the floor.
         by_name: Take classes that have the same name in both; the probability of the others stays as it is.
-        on_tile: Called after each with tiles done and all tiles.
-    """
+        on_tile: Called after each with tiles done and all tiles."""
     check_refinable(voxel_map)
     shared = _shared_classes(voxel_map.label_set, weights.model.label_set, by_name=by_name)
     frame = up_frame(voxel_map, up)

@@ -1,11 +1,8 @@
 """The semantics of one view, with as many rays and samples as the settings, or the rate to hold, allow.
 
-``add_own_image`` joins it with what the frame's image says by itself. A rendered view has the image among its sources,
-but few rays: what lies between them is filled in. The image's own features are classified at every coarse pixel.
-``upsample`` brings the coarse view to the size of the frame, along the edges of its image and depth: the coarse pixels
-round a full pixel decide together which class it is of; then it takes the probabilities of one of them. So an upsampled
-view is an index a pixel, not a vector of probabilities a pixel.
-"""
+``add_own_image`` joins it with what the frame's image says by itself at every coarse pixel; rays are few. ``upsample``
+brings the coarse view to the size of the frame, along the edges of its image and depth: an index a pixel, not a vector
+of probabilities a pixel."""
 
 from __future__ import annotations
 
@@ -85,13 +82,9 @@ class ViewRenderer:
     ) -> RenderedView:
         """Render one view, (h, w), from sources at a pose (4, 4).
 
-        Args:
-            prior_m: (h, w) float32 depth prior, 0 = none.
-            rgb: (h, w, 3) uint8 colours of the view.
-            measured: (h, w), where the prior is not filled in; None = wherever there is one.
-            computed: Whether the prior was computed from pictures: it may be farther off than a sensor's.
-            stamp_ns: Of the view, for fields with things that move; None = such things are not there.
-        """
+        ``prior_m`` is (h, w) float32 depth, 0 = none; ``rgb`` (h, w, 3) uint8. ``measured`` (h, w) is where the prior
+        is not filled in, None = wherever there is one; ``computed``: it was computed from pictures and may be farther
+        off. ``stamp_ns`` is for fields with things that move; None = such things are not there."""
         fraction, sampling = self._config.ray_fraction, self._sampling
         if self._rate_controller is not None:
             fraction, sampling = self._rate_controller.choose(prior_m.size)
@@ -116,7 +109,7 @@ class ViewRenderer:
 
 def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
     """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it is
-    known; the view as it is where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
+    known; the view itself where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
     if weight == 0 or not isinstance(field, ImageClassifier):
         return view
     with torch.inference_mode():
@@ -133,10 +126,9 @@ def add_own_image(view: RenderedView, field: SemanticField, current: EncodedView
 
 
 class RateController:
-    """Trades rays, then samples, for a target rate: at most this ``fraction`` of the pixels, and these samples.
-
-    What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample, both followed
-    from frame to frame. What it chooses depends on the machine, so a map made with it is not reproducible."""
+    """Trades rays, then samples, for a target rate: at most this ``fraction`` of the pixels, and these samples. A
+    frame's time is modelled as a part that does not depend on rays, and a cost a ray and sample; so a map is not
+    reproducible."""
 
     def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:
         self._budget_ms = RESERVE * 1e3 / target_hz

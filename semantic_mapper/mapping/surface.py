@@ -1,13 +1,11 @@
 """Reading the surface of a map: as seen from a pose, at points, as points and as a triangle mesh.
 
-Open3D's own ``ray_cast`` is off by half a voxel and can crash when its range buffer overflows; this ray caster walks
-from block to block, steps by the TSDF and finds the zero crossing on the interpolated field. There, and at any other
-point, the map is read by interpolation over the eight voxels around it, then label and confidence.
+Open3D's own ``ray_cast`` is off by half a voxel and can crash; this one walks from block to block, steps by the TSDF
+and finds the zero crossing on the interpolated field. Points are read by interpolation over the eight voxels around.
 
-With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where ``n_eff = n / (1 + rho
-(n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are worth at most 1 / rho
-independent ones. A single vote of less trust, n < 1, means what the field said: n_eff = 1. The label is the argmax, its
-confidence p[label]. Below ``unknown_below`` the label is unknown, the confidence stays."""
+With n votes of evidence e, ``p = softmax(e * n_eff / n)``, where ``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of
+one place repeat each other's errors, so a hundred of them are worth at most 1 / rho independent ones; else n_eff = 1.
+The label is the argmax, its confidence p[label]. Below ``unknown_below`` the label is unknown, the confidence stays."""
 
 from __future__ import annotations
 
@@ -63,8 +61,8 @@ def cast_view(
 ) -> tuple[Float32, Readout]:
     """See the map through a camera, up to ``depth_max_m`` away: depth (H, W), 0 = miss, and the rest.
 
-    What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
-    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)"""
+    What it may see and is on disk comes back, for a part of the image after the other where memory has no room for all.
+    (Where even what one pixel may see does not fit, its ray meets the nearest of that.)"""
     size = (intrinsics.height, intrinsics.width)
     depth, seen = np.zeros(size, np.float32), _empty_readout(size)
     lengths = config.voxel_size_m, config.truncation_voxels, config.depth_max_m
@@ -79,9 +77,8 @@ def cast_view(
 def _windows(
     grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
 ) -> Iterator[tuple[Window, Int64]]:
-    """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first.
-
-    One part, and no keys, where nothing is on disk."""
+    """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first; one
+    part, and no keys, where nothing is on disk."""
     whole = Window(0, 0, intrinsics.height, intrinsics.width)
     if not grid.stored_count:
         yield whole, np.empty(0, np.int64)
@@ -108,10 +105,8 @@ def read_points(
 
 
 def surface_voxels(keys: Int32, blocks: Int32, grid: BlockGrid, min_weight: float) -> Float64:
-    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks to look at.
-
-    ``keys`` (B, 3) are their coordinates, ``blocks`` (B,) their buffer indices; both ends of an edge need
-    ``min_weight``."""
+    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, of blocks with coordinates ``keys`` (B, 3)
+    and buffer indices (B,), in their order; both ends of an edge need ``min_weight``."""
     keys, blocks, buffers = np.ascontiguousarray(keys), np.ascontiguousarray(blocks), grid.buffers()
     starts = np.zeros(len(blocks) + 1, np.int64)
     _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts[1:])

@@ -1,10 +1,9 @@
 """Virtual views: novel viewpoints that keyframes cover and from where the map has most to learn, and their votes.
 
-A candidate stands where a keyframe stood, or a step to its side in air that a keyframe has looked through, and looks at
-surface that is in need of class votes (``surface_patches``). Its score is the need of what it sees, weighted by how
-many keyframes see that, too, and by its nearness, as votes are. What was looked at once is not looked at again.
-
-A rendered view measures nothing: TSDF, colour and weight stay as they are, to the bit, and no block is added."""
+A candidate stands where a keyframe stood, or a step to its side in air that one has looked through, and looks at
+surface in need of class votes (``surface_patches``). Its score is the need of what it sees, weighted by how many
+keyframes see that, too, and by nearness. What was looked at once is not looked at again. TSDF, colour and weight stay
+as they are, to the bit, and no block is added."""
 
 from __future__ import annotations
 
@@ -14,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from semantic_mapper.geometry import (
-    check_pose,
     invert_pose,
     look_at,
     nearest_pixels,
@@ -28,11 +26,8 @@ from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.mapping.fusion import (
     FULL_TRUST_RANGE_M,
-    ProbabilityTable,
-    checked_depth,
-    frame_votes,
     make_limits,
-    probability_table,
+    make_votes,
     vote_into_blocks,
 )
 from semantic_mapper.mapping.keyframes import Keyframe
@@ -105,7 +100,6 @@ class ViewpointChooser:
         self, voxel_map: VoxelMap, keyframes: Sequence[Keyframe], intrinsics: CameraIntrinsics
     ) -> VirtualView | None:
         """The viewpoint of most gain for a camera, to be rendered from keyframes; None where none has enough of it.
-
         After a new ``epoch`` of the map all of it may be looked at again."""
         if voxel_map.epoch != self._epoch:
             self._looked_at, self._epoch = np.empty(0, np.int64), voxel_map.epoch
@@ -219,35 +213,22 @@ def add_votes(
     T_world_camera: Float64,
     intrinsics: CameraIntrinsics,
     depth_m: Float32,
-    table: ProbabilityTable,
+    table: tuple[Float32, Int32],
 ) -> int:
-    """Give the map's surface the class votes of one view, one a voxel; nothing else of the map changes.
+    """Give the map's surface the class votes of one view (4, 4), one a voxel; returns the blocks near its surface.
 
-    A vote weighs ``VOTE_WEIGHT`` times what that of a frame would, and only voxels take it that have fewer than
-    ``MAX_VOTES``. ``frames`` does not count the view, ``version`` does.
-
-    Args:
-        T_world_camera, intrinsics: (4, 4) of the view, and of ``depth_m``.
-        depth_m: (H, W) float32, z of the map's surface in the view; 0 = none.
-        table: Probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown.
-
-    Returns:
-        Blocks that were given votes to, or would have been had they had voxels near the surface.
-    """
-    where = "votes without a frame"
-    check_pose(T_world_camera, where)
-    depth, _ = checked_depth(depth_m, None, intrinsics, where)
-    limits, classes = make_limits(voxel_map.config), len(voxel_map.label_set)
-    checked = probability_table(depth, table[0], None, table[1], classes, where)
-    camera = make_camera(intrinsics, T_world_camera)
+    A vote weighs ``VOTE_WEIGHT`` times what that of a frame would, and only voxels with fewer than ``MAX_VOTES`` take
+    it. ``frames`` does not count the view, ``version`` does. ``depth_m`` (H, W) float32 is z of the map's surface, 0 =
+    none; ``table`` has probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown."""
+    limits, camera = make_limits(voxel_map.config), make_camera(intrinsics, T_world_camera)
+    votes, _ = make_votes(*table, depth_m, camera, limits.depth_max)
+    votes = votes._replace(weights=votes.weights * np.float32(VOTE_WEIGHT))
     with voxel_map.locked() as grid:
-        votes = frame_votes(depth, checked, camera, limits.depth_max, classes, where)
-        votes = votes._replace(weights=votes.weights * np.float32(VOTE_WEIGHT))
         budget = voxel_map.config.max_blocks  # no block is added
-        packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max, budget)
+        packed = blocks_in_band(depth_m, camera, limits.voxel_size, limits.truncation, limits.depth_max, budget)
         packed = packed[np.isin(packed, grid.all_packed())]
         for blocks in voxel_map.changing(packed) if len(packed) else ():
-            vote_into_blocks(len(blocks), blocks, grid.buffers(), camera, limits, depth, votes, MAX_VOTES)
+            vote_into_blocks(len(blocks), blocks, grid.buffers(), camera, limits, depth_m, votes, MAX_VOTES)
     return len(packed)
 
 
@@ -264,8 +245,6 @@ def _sum_surface_patches(
     need: Float64,
     count: Int64,
 ) -> None:
-    """Sums over the surface voxels, of a TSDF up to ``near``, of blocks with keys (B, 3) and buffer indices (B,).
-
-    To fill, of zeros: ``total`` (B, 3) of positions in voxels, ``need`` (B,) as of ``SurfacePatches``, ``count`` (B,).
-    """
+    """Sums over the surface voxels, of a TSDF up to ``near``, of blocks with keys (B, 3) and buffer indices (B,): of
+    positions in voxels (B, 3), need as of ``SurfacePatches`` (B,), and how many (B,)."""
     ...

@@ -34,11 +34,11 @@ from semantic_mapper.mapping.changes import (
 from semantic_mapper.mapping.clearing import NO_BOUNDS, Scene, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion import (
     SURFACE_WEIGHT,
+    Votes,
     checked_depth,
     frame_votes,
     fuse_blocks,
     make_limits,
-    probability_table,
 )
 from semantic_mapper.mapping.map_file import BlockPart, MapManifest, open_map
 from semantic_mapper.mapping.map_snapshot import FrozenMap
@@ -64,15 +64,14 @@ POINT_FIELDS = ("xyz", "rgb", "label", "confidence", "measured")
 class VoxelMap:
     """Posed depth, colour and class probabilities in; surface points, mesh, views and files out.
 
-    Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Safe to call from
-    several threads: calls wait for each other, and the long ones leave the GIL to others. L = len(label_set) channels
-    of class evidence. ``ConfigError``: no map can be built with ``config``; ``MapError``: there is no memory.
+    Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Any thread may call it:
+    calls wait for each other, and the long ones leave the GIL to others. L = len(label_set) channels of class evidence.
+    ``ConfigError``: no map can be built with ``config``; ``MapError``: there is no memory.
 
-    ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
-    whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
-    are metres (``note_scale``), ``refined`` is the digest of the weights that refined the map, ``places`` are views to
-    find it again by, ``cleared`` counts voxels of surfaces that frames of this process saw through
-    (``clear_free_space``)."""
+    ``frames`` counts what is fused, ``version`` grows with every change, ``epoch`` counts how often another map has
+    replaced the whole (``take_over``): blocks may be gone then. ``scale_known``: lengths are metres. ``refined`` is the
+    digest of the weights that refined the map, ``places`` are views to find it again by, ``cleared`` counts voxels of
+    surfaces that frames of this process saw through."""
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
         self._limits = make_limits(config)
@@ -93,9 +92,8 @@ class VoxelMap:
         self.truncation_m = config.truncation_voxels * config.voxel_size_m
 
     def note_scale(self, known: bool) -> None:
-        """Say whether poses and depths of the frames to come are in metres; a map with some that are not stays unknown.
-
-        Frames do not say it: their stream does (``StreamInfo.scale_known``)."""
+        """Say whether frames to come are in metres, as their stream knows (``StreamInfo.scale_known``); a map with some
+        that are not stays unknown."""
         self.scale_known = self.scale_known and known
 
     @property
@@ -109,18 +107,18 @@ class VoxelMap:
         return self._grid.stored_count
 
     def changed_since(self, version: int) -> Int32:
-        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order; of a new
-        ``epoch``, all."""
+        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order; of a new ``epoch``,
+        all."""
         with _KERNEL_LOCK:
             return unpack_keys(self._grid.versions_since(version)[0])
 
     def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
         """The blocks changed after ``version`` was ``since`` (0: the whole map), in compact form.
 
-        At most ``limit`` blocks (0 = all), those that have been waiting longest, but never less than one whole version
-        (a frame; a loaded map is one version): who goes on asking with the version they got comes to the present map.
-        Voxels of less than ``min_weight`` count as not observed; 1 = only what was measured. ``MapError``: ``since`` is
-        not a version of this map, or a bad ``limit`` or ``min_weight``."""
+        At most ``limit`` blocks (0 = all), those that wait longest, but whole versions (a frame; a loaded map is one
+        version): who asks on with the version they got comes to the present map. Voxels of less than ``min_weight``
+        count as not observed; 1 = only what was measured. ``MapError``: ``since`` is no version of this map, or a bad
+        ``limit`` or ``min_weight``."""
         with _KERNEL_LOCK:
             return self._choose_changes(since, limit, min_weight).compact()
 
@@ -148,33 +146,29 @@ class VoxelMap:
     ) -> int:
         """Fuse one frame; returns blocks touched, 0 where the depth image holds no measurement.
 
+        ``PoseError``, ``FrameError``, ``ShapeError``: the frame cannot be used. ``MapError``: the map would grow past
+        ``max_blocks``, or the disk fails. The map is as it was; save where the disk fails amid a frame that
+        ``memory_mb`` has no room for: a part of its blocks is fused then.
+
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
             depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
-            rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
-                which row is a pixel's, -1 = unknown. ``known`` is None then.
+            rows: (H, W) int32, which row of ``probabilities``, (K, L) then, is a pixel's; -1 = unknown.
             trust: (H, W) float32 0..1, how much of its full weight each depth and its vote count; None = 1.
-            measured: Whether a sensor measured the depth; what was computed weighs less (``mapping/fusion.py``).
-
-        Raises:
-            PoseError, FrameError, ShapeError: the frame cannot be used.
-            MapError: the map would grow past ``max_blocks``, or the disk fails.
-            The map is as it was, and the next frame is welcome; save where the disk fails in the midst of a frame that
-            ``memory_mb`` has no room for: a part of its blocks has been fused then.
-        """
+            measured: Whether a sensor measured the depth; what was computed weighs less (``mapping/fusion.py``)."""
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
         if frame.intrinsics.distorted:
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
         depth, weights = checked_depth(depth_m, trust, frame.intrinsics, where)
-        table = None
-        if probabilities is not None:
-            table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
-        camera = make_camera(frame.intrinsics, frame.T_world_camera)
+        camera, classes = make_camera(frame.intrinsics, frame.T_world_camera), len(self.label_set)
         with _KERNEL_LOCK:
-            votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
+            votes = Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
+            if probabilities is not None:
+                of_map = camera, self.config.depth_max_m, classes, where
+                votes = frame_votes(depth, probabilities, known, rows, weights, *of_map)
             lengths = self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m
             packed = blocks_in_band(depth, camera, *lengths, frame_budget(self.config.max_blocks))
             scene = Scene(camera, self._limits, depth, np.ascontiguousarray(frame.rgb))
@@ -201,14 +195,13 @@ class VoxelMap:
 
     @contextmanager
     def locked(self) -> Iterator[BlockGrid]:
-        """The storage itself, for passes over it that are no part of this class; other threads wait meanwhile."""
+        """The storage itself, for passes that are no part of this class; other threads wait meanwhile."""
         with _KERNEL_LOCK:
             yield self._grid
 
     def changing(self, packed: Int64) -> Iterator[Int32]:
-        """Bring blocks with unique packed keys (B,) into memory for a pass that changes them; hold the lock meanwhile.
-
-        Yields buffer indices of those that memory has room for at a time. Together they are one new ``version``."""
+        """Bring blocks with unique packed keys (B,) into memory for a pass that changes them, under the lock: buffer
+        indices of as many as memory has room for at a time. Together they are one new ``version``."""
         version = self.version + 1
         for blocks in self._grid.batches(packed):
             yield blocks
@@ -216,11 +209,11 @@ class VoxelMap:
             self.version = version
 
     def take_over(self, other: VoxelMap) -> None:
-        """Become ``other``, all at once for readers in other threads; ``other``, of the same config and classes (else
-        ``MapError``), must not be used any more.
+        """Become ``other``, of the same config and classes (else ``MapError``), all at once for other threads;
+        ``other`` must not be used any more.
 
-        Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone. For
-        ``changes`` with a limit, ``version`` grows by one for each ``BLOCKS_A_VERSION`` of them."""
+        All blocks count as changed, and ``epoch`` goes up. For ``changes`` with a limit, ``version`` grows by one for
+        each ``BLOCKS_A_VERSION`` of them."""
         if (other.config, other.label_set) != (self.config, self.label_set):
             raise MapError("a map can only take over one of the same config and label set")
         with _KERNEL_LOCK:
@@ -232,8 +225,8 @@ class VoxelMap:
             self.epoch += 1
 
     def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
-        """Points of the surface, at most three a voxel, in a fixed order, without voxels of less than ``min_weight`` (1
-        = only what was measured)."""
+        """Points of the surface, at most three a voxel, in a fixed order; 1 as ``min_weight`` = only what was
+        measured."""
         _check_min_weight(min_weight)
         parts: list[MapPoints] = []
         with _KERNEL_LOCK:
@@ -255,10 +248,8 @@ class VoxelMap:
         return parts[0] if len(parts) == 1 else join_meshes(parts)
 
     def to_open3d(self) -> Any:
-        """A copy of the whole map, which is not empty, as an ``open3d.t.geometry.VoxelBlockGrid``.
-
-        Its attributes are tsdf, weight and color (float32, as Open3D's own ``integrate`` leaves them), label (uint8 id,
-        the ignore id where unknown), and evidence and votes as they are stored."""
+        """A copy of the whole map, which is not empty, as an ``open3d.t.geometry.VoxelBlockGrid`` with tsdf, weight and
+        color (float32), label (uint8 id, the ignore id where unknown), and evidence and votes as they are stored."""
         state = self.block_state()
         keys = np.asarray(state.pop("keys"), np.int32)
         if not len(keys):
@@ -277,8 +268,8 @@ class VoxelMap:
     def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
-        keys (B, 3) int32, in lexicographic order where none were given; tsdf, weight, votes (B, 8, 8, 8), color (B, 8,
-        8, 8, 3) float32 and evidence (B, 8, 8, 8, L) as it is stored, voxels in the order [z][y][x]."""
+        keys (B, 3) int32, by default in lexicographic order; tsdf, weight, votes (B, 8, 8, 8), color (B, 8, 8, 8, 3)
+        and evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x]."""
         with _KERNEL_LOCK:
             keys = self._grid.all_keys() if keys is None else keys
             values = self._grid.read(pack_keys(keys))
@@ -286,10 +277,9 @@ class VoxelMap:
         return {"keys": keys, **{name: v.reshape(*cube, *v.shape[2:]) for name, v in values._asdict().items()}}
 
     def save(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
-        """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
-
-        Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most. ``between`` is called
-        after each of them. ``MapError``: the file cannot be written; one that was there before is as it was."""
+        """Write the map as it is now to one file (``map.npz``), whole or not at all, while other threads go on
+        integrating. ``between`` is called after each ``CHUNK_BLOCKS``. ``MapError``: it cannot be written; a file from
+        before is as it was."""
         self.snapshot().write(path, between)
 
     def snapshot(self) -> FrozenMap:
@@ -316,9 +306,9 @@ class VoxelMap:
     def load(cls, path: Path, memory_mb: int | None = None, config: VoxelMapConfig | None = None) -> VoxelMap:
         """Read a saved map; it is the saved one bit for bit and can go on integrating.
 
-        ``memory_mb`` stands in place of the saved setting, for a machine with less memory, say; 0 = no limit.
-        ``config``, of voxels of the same size (else ``ConfigError``), stands in place of all settings. ``MapError``: no
-        such file, not a map, of another format version, or damaged (and what is)."""
+        ``memory_mb`` stands in place of the saved setting; 0 = no limit. ``config``, of voxels of the same size (else
+        ``ConfigError``), stands in place of all settings. ``MapError``: no such file, not a map, of another format
+        version, or damaged (and what is)."""
         with open_map(path) as reader:
             saved = reader.manifest
             config = config or saved.config
@@ -356,10 +346,9 @@ class VoxelMap:
     def add(self, other: VoxelMap, T_self_other: Float64) -> None:
         """Add all that another map, which lies at ``T_self_other`` (4, 4) in this one, has measured; see ``merge``.
 
-        Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly; else
-        those of ``other`` are interpolated. After an error of the disk the map holds a part of ``other``. ``MapError``:
-        the maps do not fit each other, have places of the same frames, only one is in metres, or this one would grow
-        past ``max_blocks``."""
+        Where voxels coincide measurements add up exactly; else those of ``other`` are interpolated. After an error of
+        the disk the map holds a part of ``other``. ``MapError``: the maps do not fit each other, have places of the
+        same frames, only one is in metres, or this one would grow past ``max_blocks``."""
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
         if self.frames:

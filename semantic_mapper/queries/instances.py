@@ -275,12 +275,7 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
     frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
     middle = xyz.mean(axis=0)
     plan = ((xyz - middle) @ frame)[:, :2]
-    hull = cv2.convexHull(plan.astype(np.float32)).reshape(-1, 2).astype(np.float64)
-    sides = np.roll(hull, -1, axis=0) - hull
-    yaws = [math.atan2(y, x) % (math.pi / 2) for x, y in sides if x or y] or [0.0]
-    c, s = np.array([[math.cos(yaw)] for yaw in yaws]), np.array([[math.sin(yaw)] for yaw in yaws])
-    along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s  # (sides, N)
-    yaw = min(zip(np.ptp(along, axis=1) * np.ptp(across, axis=1), yaws, strict=True))[1]
+    yaw = math.radians(cv2.minAreaRect(plan.astype(np.float32))[2]) % (math.pi / 2)
     if np.diff(np.ptp(plan @ _turn(yaw), axis=0))[0] > 0:
         yaw += np.pi / 2
     R = frame.copy()
