@@ -83,12 +83,6 @@ def test_sets_that_contradict_themselves_are_refused(
         LabelSet("bad", ids, names, (RED,) * len(names), ignore_id)
 
 
-def test_a_class_is_found_by_name_and_the_error_lists_them() -> None:
-    assert (GAPS.id_of("wall"), GAPS.id_of("lamp")) == (9, 200)
-    with pytest.raises(LabelError, match=r"'gaps' has no class 'lmap'; it has wall, chair, lamp"):
-        GAPS.id_of("lmap")
-
-
 def test_things_are_what_is_not_stuff() -> None:
     assert GAPS.thing_ids(STUFF_NAMES) == (2, 200)
     assert GAPS.thing_ids(()) == (9, 2, 200) and GAPS.thing_ids(("chair", "lamp")) == (9,)

@@ -3,15 +3,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
-import cv2
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.plots import (
     UNKNOWN,
@@ -23,7 +20,6 @@ from semantic_mapper.plots import (
     put_title,
     rendered,
     text_width,
-    write_picture,
 )
 from tests.figures import figure_of
 
@@ -65,15 +61,6 @@ def test_matplotlib_is_imported_when_something_is_drawn_and_says_nothing_of_a_ho
         [sys.executable, "-c", code], capture_output=True, text=True, env={**homeless, "HOME": "/proc/none"}, check=True
     )
     assert done.stdout.split() == ["set()", "False"] and done.stderr == ""
-
-
-def test_pictures_are_written_or_say_why_not(tmp_path: Path) -> None:
-    picture = draw_names(("one",))
-    write_picture(tmp_path / "new" / "names.png", picture)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new" / "names.png"))[..., ::-1], picture)
-    (tmp_path / "file").touch()
-    with pytest.raises(SemanticMapperError, match=r"names\.png: cannot be written"):
-        write_picture(tmp_path / "file" / "names.png", picture)
 
 
 def test_unknown_is_grey_and_the_last_of_the_legend() -> None:

@@ -18,12 +18,6 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("semantic_mapper", "drivers", "replay", "nodes")
 
 
-def sources() -> list[Path]:
-    return [
-        path for package in (*FOLDERS, "research", "tools", "tests") for path in sorted((ROOT / package).rglob("*.py"))
-    ]
-
-
 def pyproject() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
@@ -56,12 +50,6 @@ def test_the_command_line_starts_without_heavy_packages() -> None:
     program = f"import sys, semantic_mapper.nodes.cli.main; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
     assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
-
-
-def test_one_file_loads_open3d() -> None:
-    loading = re.compile(r"^\s*(import|from) open3d|import_module\(\s*[\"']open3d", re.MULTILINE)
-    files = [p.relative_to(ROOT).as_posix() for p in sources() if loading.search(p.read_text(encoding="utf-8"))]
-    assert files == ["semantic_mapper/mapping/open3d_loader.py"]
 
 
 def test_no_file_names_a_machine_or_a_package_index() -> None:

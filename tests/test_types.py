@@ -26,11 +26,6 @@ def frame(**changed: object) -> PosedFrame:
     return PosedFrame(**(parts | changed))  # type: ignore[arg-type]
 
 
-def test_a_whole_frame_and_one_without_depth_and_labels_are_accepted() -> None:
-    assert frame().seq == 7
-    assert frame(depth_m=None, label=None).depth_m is None
-
-
 @pytest.mark.parametrize(
     ("part", "value"),
     [

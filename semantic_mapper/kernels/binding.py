@@ -101,8 +101,7 @@ def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
 
     Its annotations say how each argument is passed: ``NDArray`` of one dtype as the array struct of that type in C,
     ``NDArray[Any]`` as an ``AnyArray``, ``int``, ``bool`` and ``float`` as numbers of 8 bytes, a named tuple as a
-    struct of its fields. It returns None or an int.
-    """
+    struct of its fields. It returns None or an int."""
     return Kernel(declaration)
 
 
@@ -209,11 +208,10 @@ def parallel_kernel(
 ) -> Callable[[Callable[Concatenate[int, P], None]], ParallelKernel[P]]:
     """A `kernel` whose loop runs on several threads.
 
-    The declaration's first argument is the number of iterations; C gets the range of a part of them as ``start`` and
-    ``stop``, and returns 0, or 1 where it lacks memory for its buffers, which raises MemoryError. Iterations must not
-    depend on each other: the result is then the same to the bit for any number of threads. ``chunks_per_thread``: more
-    than 1 where iterations differ in cost. A chunk costs some 20 microseconds.
-    """
+    The declaration's first argument is the number of iterations; C gets a range of them as ``start`` and ``stop``, and
+    returns 0, or 1 where it lacks memory, which raises MemoryError. Iterations must not depend on each other: the
+    result is the same to the bit for any number of threads. ``chunks_per_thread``: more than 1 where iterations differ
+    in cost."""
 
     def decorate(declaration: Callable[Concatenate[int, P], None]) -> ParallelKernel[P]:
         return ParallelKernel(Kernel(declaration, skip=1), chunks_per_thread)
@@ -235,10 +233,9 @@ def _count_of_environment() -> int:
 def _stop_spinning() -> None:
     """Make torch's OpenMP threads sleep between operations where torch was loaded before this package.
 
-    By default GNU OpenMP lets its threads spin for about 3 ms after each operation; a step of the mapper then takes 15
-    times as long. It lets them spin for next to nothing once it manages more threads than there are cores. One more
-    team of threads, which belongs to a thread that sleeps for good, sees to that.
-    """
+    By default GNU OpenMP lets its threads spin for about 3 ms after each operation, so that a step of the mapper takes
+    15 times as long, but next to not at all once it manages more threads than there are cores. One more team of
+    threads, which belongs to a thread that sleeps for good, sees to that."""
     if not semantic_mapper.SPINNING_THREADS:
         return
     import torch  # is loaded

@@ -85,10 +85,9 @@ def _point_to_plane(
 def compare(
     level: Level, target: Level, T_target_camera: Float64, outlier_m: float = OUTLIER_M, noise_m: float = np.inf
 ) -> Fit:
-    """How a view lies on another one, at one size, from a pose ``T_target_camera`` (4, 4).
-
-    Points further than ``outlier_m`` from the surface do not count; distances beyond ``noise_m``, of depth at 1 m,
-    count less in the normal matrix (infinite = all alike)."""
+    """How a view lies on another one, at one size, from a pose ``T_target_camera`` (4, 4). Points further than
+    ``outlier_m`` from the surface do not count; distances beyond ``noise_m``, of depth at 1 m, count less in the normal
+    matrix."""
     matrix, gradient, sums = np.empty((6, 6)), np.empty(6), np.empty(9)
     lens = np.array((target.intrinsics.fx, target.intrinsics.fy, target.intrinsics.cx, target.intrinsics.cy))
     pose, limits = np.ascontiguousarray(T_target_camera), (outlier_m, noise_m)
@@ -113,9 +112,7 @@ def fit(levels: Sequence[Level], target: Target, T_world_camera: Float64) -> Fit
 
 def align(levels: Sequence[Level], targets: Sequence[Target], T_world_camera: Float64) -> Float64 | None:
     """Pose (4, 4) of a view, from a first guess: to the first target from coarse to fine, then to all at the finest
-    level.
-
-    None where hardly a point lies on a target."""
+    level; None where hardly a point lies on a target."""
     pose = T_world_camera
     for number, count in zip(range(len(levels) - 1, -1, -1), ITERATIONS, strict=True):
         chosen = targets if number == 0 else targets[:1]
@@ -143,10 +140,8 @@ def gauss_newton_step(normal_matrix: Float64, gradient: Float64) -> Float64:
 
 
 def flat_directions(normal_matrices: Sequence[Float64]) -> tuple[Float64, Float64] | None:
-    """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, of which points say nothing.
-
-    None where they say something of all, as usual. A wall that fills the picture leaves a turn and two shifts open.
-    ``normal_matrices`` are (6, 6) each, of ``fit``."""
+    """Projections (3, 3) on the turns and on the shifts of the camera, in its own axes, of which points say nothing by
+    the (6, 6) matrices of ``fit``; None where they say something of all. A wall leaves a turn and two shifts open."""
     total = sum(normal_matrices, np.zeros((6, 6)))
     flat: list[Float64] = []
     for part, least in ((total[:3, :3], _FLAT_TURN), (total[3:, 3:], FALSE)):

@@ -52,9 +52,8 @@ def find_features(rgb: UInt8, depth_m: Float32, count: int) -> Features:
 
 
 def find_place_features(rgb: UInt8, depth_m: Float32, count: int, width: int = 320) -> Features:
-    """The strongest ``count`` SIFT features of an image, made ``width`` pixels wide where it is wider, and their depth.
-
-    Descriptors are RootSIFT in bytes. Pixels are those of ``rgb``, as big as ``depth_m``."""
+    """The strongest ``count`` SIFT features of an image, made ``width`` pixels wide where it is wider, and their depth:
+    RootSIFT in bytes, pixels of ``rgb``, which is as big as ``depth_m``."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, width / gray.shape[1])
     if scale < 1:
@@ -69,9 +68,8 @@ def find_place_features(rgb: UInt8, depth_m: Float32, count: int, width: int = 3
 
 
 def match_features(ours: UInt8, theirs: UInt8) -> Matches:
-    """Pairs of alike descriptors (M, 2) int64, as (number of ours, number of theirs), each in one pair at most.
-
-    Of ORB the mutually nearest ones; of SIFT those whose second nearest is clearly further off."""
+    """Pairs of alike descriptors (M, 2) int64, as (number of ours, of theirs), each in one pair at most: of ORB the
+    mutually nearest ones, of SIFT those whose second nearest is clearly further off."""
     if len(ours) < 2 or len(theirs) < 2:
         return np.zeros((0, 2), np.int64)
     if ours.shape[1] != _SIFT_LENGTH:
@@ -94,8 +92,7 @@ def match_features(ours: UInt8, theirs: UInt8) -> Matches:
 def pose_from_points(
     points: Float64, pixels: Float64, intrinsics: CameraIntrinsics, min_inliers: int, reprojection_px: float
 ) -> tuple[Float64, Matches] | None:
-    """Pose of a camera that sees points (M, 3) at pixels (M, 2): ``T_points_camera`` (4, 4), and which ones agree (K,).
-
+    """Pose of a camera that sees points (M, 3) at pixels (M, 2): ``T_points_camera`` (4, 4), and which ones agree (K,);
     None where fewer than ``min_inliers`` do."""
     if len(points) < max(min_inliers, _LEAST):
         return None
@@ -123,9 +120,8 @@ def pose_from_points(
 def pose_from_features(
     image: Features, other: Features, intrinsics: CameraIntrinsics, min_matches: int, reprojection_px: float = 2.0
 ) -> tuple[Float64, int] | None:
-    """Where the camera was in the axes of another image, ``T_other_camera`` (4, 4), and how many features say so.
-
-    The depth of the other image alone is used. None where fewer than ``min_matches`` features agree."""
+    """Where the camera was in the axes of another image, ``T_other_camera`` (4, 4), by that one's depth, and how many
+    features say so; None where fewer than ``min_matches`` agree."""
     deep = np.flatnonzero(other.depth_m > 0)
     if len(deep) < min_matches or len(image.pixels) < min_matches:
         return None

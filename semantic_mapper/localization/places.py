@@ -1,8 +1,5 @@
-"""Places seen so far: which of them an image shows, and what a map keeps of its own.
-
-Matches are counted with each place in turn (1 ms each), which is exact and needs no vocabulary; a few hundred places
-are as many as a map keeps.
-"""
+"""Places seen so far: which of them an image shows, and what a map keeps of its own. Matches are counted with each
+place in turn (1 ms each), which is exact and needs no vocabulary."""
 
 from __future__ import annotations
 
@@ -21,9 +18,8 @@ _SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all pla
 
 
 def rank_places(features: Features, descriptors: Mapping[int, UInt8], count: int) -> list[tuple[int, int]]:
-    """The places most like an image, best first, as (key, number of features that match); in their order if equal.
-
-    At most ``count``, each with at least one match; ``descriptors`` are (N, 128) of each place, by key."""
+    """The places most like an image, best first, at most ``count``, as (key, number of features that match, at least
+    one); ``descriptors`` are (N, 128) of each place, by key."""
     scored = [(key, len(match_features(features.descriptors, theirs))) for key, theirs in descriptors.items()]
     scored.sort(key=lambda item: -item[1])
     return [(key, score) for key, score in scored[:count] if score > 0]
@@ -62,8 +58,7 @@ def shared_places(ours: Iterable[Place], theirs: Iterable[Place]) -> int:
 
 
 class PlaceStore:
-    """The places of a map, oldest first; beyond ``capacity`` the younger of the two that are nearest to each other
-    goes."""
+    """The places of a map, oldest first; beyond ``capacity`` the younger of the two nearest to each other goes."""
 
     def __init__(self, places: Iterable[Place] = (), capacity: int = MAX_PLACES) -> None:
         self._places = list(places)

@@ -124,8 +124,7 @@ class _Tried:
 
 
 class Relocalizer:
-    """Finds frames in a map, the ``surface``, by its ``places``; ``ignore_id`` is of its classes. Deterministic;
-    changes nothing."""
+    """Finds frames in a map, the ``surface``, by its ``places``; ``ignore_id`` is of its classes. Deterministic."""
 
     def __init__(self, places: Sequence[Place], surface: MapSurface, ignore_id: int = 255) -> None:
         self._places = places
@@ -140,16 +139,11 @@ class Relocalizer:
         classify: Callable[[], UInt8] | None = None,
         features: Features | None = None,
     ) -> Relocalized | NotFound:
-        """Find a frame.
+        """Find a frame by rectified rgb (H, W, 3) uint8 and depth (H, W) float32 z as a sensor measured it, 0 = none.
 
-        Args:
-            rgb: (H, W, 3) uint8, rectified.
-            depth_m: (H, W) float32 z as a sensor measured it, 0 = none.
-            intrinsics: Of both.
-            classify: Gives class ids (h, w) uint8 of the map's label set as something sees them in the frame, which
-                have to be the map's; called where all else agrees.
-            features: Of the frame, where they are known (``find_place_features``).
-        """
+        ``classify`` gives class ids (h, w) uint8 of the map's label set as something sees them in the frame, which have
+        to be the map's; called where all else agrees. ``features`` of the frame, where they are known
+        (``find_place_features``)."""
         if not self._places:
             return NotFound("no-places", "the map has nothing to find oneself by")
         if depth_m is None or float((depth_m > 0).mean()) < _LEAST_DEPTH:
@@ -208,9 +202,8 @@ class Relocalizer:
     def _align(
         self, guess: Float64, landmarks: _Landmarks, depth_m: Float32, small: CameraIntrinsics, whole: CameraIntrinsics
     ) -> Float64 | None:
-        """The pose near a guess at which the depth fits the map's ray cast best, point to plane, (4, 4).
-
-        Landmarks hold it where surfaces leave it free to slide. None where that leads away from the guess."""
+        """The pose near a guess at which the depth fits the map's ray cast best, point to plane, (4, 4); landmarks hold
+        it where surfaces leave it free to slide. None where that leads away from the guess."""
         points = unproject(depth_m, small).reshape(-1, 3)
         points = points[points[:, 2] > 0]
         points = points[:: max(1, len(points) // _POINTS)]
@@ -441,8 +434,8 @@ def find_consensus(seen: Sequence[Sighting]) -> Consensus:
 
 
 def agreed(agreeing: Sequence[Sighting]) -> Float64:
-    """T_map_world (4, 4) that fits all of those that agree best: it takes what their cameras look at to where they say.
-    Those that are far from the others count for less."""
+    """T_map_world (4, 4) that fits all of those that agree best, far ones less: it takes what their cameras look at
+    there."""
     old = np.concatenate([transform(s.T_world_camera, _LOOKED_AT) for s in agreeing])
     new = np.concatenate([transform(s.T_map_world @ s.T_world_camera, _LOOKED_AT) for s in agreeing])
     weights = np.ones(len(agreeing))

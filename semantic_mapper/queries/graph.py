@@ -1,7 +1,4 @@
-"""Floors, rooms, doors and things of a map, and which belong to which, and their picture.
-
-Ids stay while the map grows.
-"""
+"""Floors, rooms, doors and things of a map, which belong to which, and their picture. Ids stay while the map grows."""
 
 from __future__ import annotations
 
@@ -110,9 +107,8 @@ class GraphTracker:
     """Finds the graph of one map again and again. Safe to call from several threads.
 
     A room is what an earlier one became where it holds the most of that one's floor, and at least a tenth; of several
-    that became one, the oldest id stays. A floor is the earlier one that is within half a metre of its height.
-    ``up`` (3,), a direction in the world, is by default found by the floor of the first map that has one, and kept.
-    """
+    that became one, the oldest id stays. A floor is the earlier one within half a metre of its height. ``up`` (3,) in
+    the world is by default found by the floor of the first map that has one."""
 
     def __init__(self, up: ArrayLike | None = None) -> None:
         self._up = None if up is None else check_up(up)
@@ -128,10 +124,8 @@ class GraphTracker:
             return () if self._things is None else self._things.gone
 
     def up_in(self, snapshot: MapSnapshot) -> Float64:
-        """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet.
-
-        Raises MapError: it is not known, and the map does not show it.
-        """
+        """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet, else
+        ``MapError``."""
         with self._lock:
             if self._up is None:
                 self._up = find_up(surface_points(snapshot, surface_voxels(snapshot)), snapshot.label_set)
@@ -139,9 +133,7 @@ class GraphTracker:
 
     def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:
         """The graph of the map as it is now, with ``things`` of it that another has found; by default this finds them.
-
-        Raises MapError: lengths of the map are not metres, or which way is up is not known (``up_in``).
-        """
+        ``MapError``: lengths of the map are not metres, or which way is up is not known."""
         require_metres(snapshot.scale_known, "graph")
         up = self.up_in(snapshot)
         R_grid_world = turn_onto(up, np.array((0.0, 0.0, 1.0)))
@@ -207,8 +199,8 @@ def find_graph(voxel_map: VoxelMap) -> SceneGraph | None:
 
 
 def find_floors(height: Float64, area_m2: float) -> list[float]:
-    """Heights of floors, ascending: where level surface is largest, and as far apart as storeys are; by the heights
-    (N,) in metres of voxels of surface that one could stand on, each of which covers ``area_m2``."""
+    """Heights of floors, ascending, where level surface is largest, and as far apart as storeys are: by the heights
+    (N,) in metres of voxels that one could stand on, each of which covers ``area_m2``."""
     if not len(height):
         return []
     layer = np.floor(height / LAYER_M).astype(np.int64)
@@ -226,10 +218,8 @@ def find_floors(height: Float64, area_m2: float) -> list[float]:
 
 
 def _surface(snapshot: MapSnapshot, R_grid_world: Float64, every: int) -> tuple[Float64, UInt8, Bool]:
-    """Surface points (N, 3) in the plan's frame, metres, z up; class ids (N,); whether one could stand there (N,).
-
-    One of ``every`` voxels is kept, by the sum of its coordinates: so many that each cell of the plan has one.
-    """
+    """Surface points (N, 3) in the plan's frame, metres, z up; class ids (N,); whether one could stand there (N,). One
+    of ``every`` voxels is kept, by the sum of its coordinates: so many that each cell of the plan has one."""
     surface = surface_voxels(snapshot)
     if every > 1:
         x, y, z = (surface.voxel >> shift & 7 for shift in (0, 3, 6))  # in its block of 8^3
@@ -246,9 +236,7 @@ def _surface(snapshot: MapSnapshot, R_grid_world: Float64, every: int) -> tuple[
 
 def _plan(xyz: Float64, label: UInt8, floor_m: float, cell_m: float, labels: LabelSet) -> tuple[Int64, Bool, Bool]:
     """First cell (x, y), and on cells (H, W), row = y, where floor or furniture was seen, and where there is a wall.
-
-    Surface without a class is a wall where most of the map has none; elsewhere it is the back of something thin.
-    """
+    Surface without a class is a wall where most of the map has none; elsewhere it is the back of something thin."""
     furniture, upright = np.zeros(256, np.bool_), np.ones(256, np.bool_)
     furniture[list(labels.thing_ids(STUFF_NAMES | HUNG_NAMES))] = True
     upright[[i for i, name in zip(labels.ids, labels.names, strict=True) if name in LEVEL_NAMES]] = False
@@ -333,10 +321,8 @@ def _room_of(
 
 @rendered
 def draw_graph(title: str, graph: SceneGraph) -> Figure:
-    """Rooms in colours with id and area, doors as white dots with their width, things as dots, the large with class.
-
-    A name that would cover another is left out.
-    """
+    """Rooms in colours with id and area, doors as white dots with their width, things as dots, the large with class; a
+    name that would cover another is left out."""
     count = max(len(graph.floors), 1)
     figure = new_figure(FLOOR_WIDTH * count, FLOOR_HEIGHT, layout="constrained")
     figure.suptitle(cut(title, FLOOR_WIDTH * count - 30, TITLE_PT, "bold"), x=0.012, ha="left")

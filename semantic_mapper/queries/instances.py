@@ -104,14 +104,11 @@ class _Whole(NamedTuple):
 class InstanceTracker:
     """Finds the instances of one map again and again. Safe to call from several threads.
 
-    An instance is what an instance of the last update became where it holds the most of that one's voxels, and at least
-    a tenth. Of several that became one, the oldest id stays; of a split, the largest part keeps the id.
-
-    A thing of which more than half was seen through since it was whole has gone (``gone``); what is left of it gets a
-    new id. One that is only no longer found (its class or the map's poses have changed) has not gone.
-
-    Pieces below ``min_voxels`` are left out; ``up`` (3,) is the direction in the world along which boxes stand.
-    """
+    An instance is what one of the last update became where it holds the most of that one's voxels, and at least a
+    tenth. Of several that became one, the oldest id stays; of a split, the largest part keeps the id. A thing of which
+    more than half was seen through since it was whole has gone (``gone``); what is left of it gets a new id. One that
+    is only no longer found has not gone. Pieces below ``min_voxels`` are left out; ``up`` (3,) is along which boxes
+    stand."""
 
     def __init__(self, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         if min_voxels < 1:
@@ -133,10 +130,7 @@ class InstanceTracker:
             return tuple(self._gone)
 
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
-        """The instances of the map as it is now, by ascending id.
-
-        Raises MapError: lengths of the map are not metres.
-        """
+        """The instances of the map as it is now, by ascending id; ``MapError``: its lengths are not metres."""
         require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(STUFF_NAMES))] = True
@@ -218,8 +212,8 @@ class InstanceTracker:
 
 
 def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, Int64]:
-    """How many voxels of a thing have a surface still, of whichever class, and the stamp of each voxel cleared there,
-    ascending. None are cleared where these are too few to be what the thing has lost."""
+    """How many voxels of a thing have a surface still, and the stamp of each voxel cleared there, ascending; none where
+    these are too few to be what the thing has lost."""
     packed = pack_keys(whole.thing.voxels >> 3)
     rows = snapshot.cleared.between(whole.version, snapshot.version)
     of_thing = np.isin(rows.packed, packed)
@@ -264,9 +258,7 @@ def connect_voxels(
     packed: Int64, start: Int64, voxel: Int32, label: UInt8, used: Int64, node: Int32, first: Int64
 ) -> None:
     """Write the ``first`` voxel of the component of each of the ``ThingVoxels`` (N,): union-find over 26 neighbours.
-
-    ``used`` (B,) is the number of each block among the U that have voxels, ``node`` (U, 512) scratch, -1.
-    """
+    ``used`` (B,) numbers the U blocks that have voxels, ``node`` (U, 512) is scratch, -1."""
     ...
 
 

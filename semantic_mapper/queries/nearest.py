@@ -32,9 +32,8 @@ def nearest(
 ) -> NearestSurface | None:
     """The surface point of a class that is nearest to a point (3,), world metres; ``None`` where the map has none.
 
-    Places that are less sure of the class than ``min_confidence``, 0..1, do not count. Raises LabelError: no such
-    class; lists those there are. MapError: a bad point or confidence.
-    """
+    Places that are less sure than ``min_confidence``, 0..1, do not count. ``LabelError``: no such class; lists those
+    there are. ``MapError``: a bad point or confidence."""
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
     if not 0 <= min_confidence <= 1:
@@ -78,11 +77,9 @@ def search_blocks(
     voxels: BlockVoxels,
     found: Float64,
 ) -> int:
-    """Look for the surface point of a class nearest to ``p`` in blocks (R,) in the order of their ``bounds``.
-
-    Places of less confidence than ``least``, times 255, do not count. Returns slot * 512 + voxel, -1 = none is nearer
-    than ``found`` (4,), the nearest point so far and the square of its distance in voxels, which is updated.
-    """
+    """Look for the surface point of a class nearest to ``p`` in blocks (R,) in the order of their ``bounds``; of less
+    confidence than ``least``, times 255, it does not count. Returns slot * 512 + voxel, -1 = none is nearer than
+    ``found`` (4,), the nearest so far and the square of its distance in voxels, which is updated."""
     ...
 
 
@@ -105,9 +102,8 @@ class PointAnswers:
 def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
     """Class and confidence of the surface at points (N, 3), world metres, and whether they are free or occupied.
 
-    The class is that of the surface voxel whose surface point is nearest, where that is at most ``radius_m`` away: by
-    default 2.5 voxels, at most 25. Raises MapError: bad points, or a radius out of range.
-    """
+    The class is that of the voxel whose surface point is nearest, at most ``radius_m`` away: by default 2.5 voxels, at
+    most 25. ``MapError``: bad points, or a radius out of range."""
     p, most = check_points(points, snapshot), MAX_RADIUS_VOXELS * snapshot.voxel_size_m
     radius = RADIUS_VOXELS if radius_m is None else check_positive(radius_m, "radius_m", most) / snapshot.voxel_size_m
     slot, voxel, distance = np.empty(len(p), np.int64), np.empty(len(p), np.int64), np.empty(len(p))

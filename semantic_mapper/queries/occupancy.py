@@ -22,10 +22,9 @@ MAX_BOX_VOXELS = 1 << 24  # 134 m^3 at 2 cm; about 0.5 GB while the distances ar
 class State(IntEnum):
     """What is known of a voxel.
 
-    Occupied: the surface is at most half a voxel in front of it, or it lies behind a surface, up to the truncation.
-    Unknown is also the air that cameras looked through far from any surface: the map keeps no blocks there.
-    Moving: something that moves, and is left out of the map, was there within the last second: an obstacle for now.
-    """
+    Occupied: the surface is at most half a voxel in front of it, or up to the truncation. Unknown is also the air far
+    from any surface, where the map keeps no blocks. Moving: something that moves, and is left out of the map, was there
+    within the last second."""
 
     UNKNOWN = 0
     FREE = 1
@@ -53,15 +52,9 @@ def occupancy(snapshot: MapSnapshot, points: ArrayLike) -> UInt8:
 def distance_field(
     snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike, *, unknown_is_occupied: bool = False
 ) -> DistanceField:
-    """Euclidean distance to the nearest occupied or moving voxel for every voxel with its centre in a box.
-
-    Only voxels in the box count as obstacles: give the box a margin of the distance that matters. Raises MapError: a
-    bad box, or no voxel or more than ``MAX_BOX_VOXELS`` in it.
-
-    Args:
-        lower, upper: (3,) corners, world metres.
-        unknown_is_occupied: Whether what was never seen is an obstacle, too.
-    """
+    """Euclidean distance to the nearest occupied or moving voxel for every voxel with its centre in a box with corners
+    (3,), world metres; only voxels in the box count as obstacles, what was never seen where ``unknown_is_occupied``.
+    ``MapError``: a bad box, or no voxel or more than ``MAX_BOX_VOXELS`` in it."""
     low, high = check_box(lower, upper, snapshot)
     first = np.ceil(low - 1e-6).astype(np.int64)  # 1e-6 voxels: corners that were meant to be voxel centres
     shape = np.floor(high + 1e-6).astype(np.int64) - first + 1

@@ -1,13 +1,12 @@
 """Questions to the map of a running mapper, their answers, and both as bytes: ``[name, msgpack header, arrays]``.
 
-A question is a struct of fields; an answer is any struct or frozen dataclass, as the functions of this package return
-them. Where one of them has an array, its header says ``{dtype, shape, start, bytes}``: its elements, little-endian and
-row by row, lie in the third part from ``start`` on. Arrays of single bytes are zstd frames there.
+A question is a struct, an answer any struct or frozen dataclass, as the functions of this package return them. Where
+one has an array, its header says ``{dtype, shape, start, bytes}``: its elements, little-endian and row by row, lie in
+the third part from ``start`` on; of single bytes, a zstd frame.
 
 Header of a question: its fields. Of an answer: ``map`` (``MapState``) and ``answer``. In the place of an answer may
-come an error, ``["error", header]``. Every size is checked before anything is allocated by it, and whatever is wrong is
-a ``CodecError``.
-"""
+come an error, ``["error", header]``. Sizes are checked before anything is allocated; what is wrong is a
+``CodecError``."""
 
 from __future__ import annotations
 
@@ -57,11 +56,8 @@ _RAISED = {
 
 
 class Request(Wire, Generic[AnswerT], frozen=True, kw_only=True):
-    """What every question has; ``AnswerT`` is what answers it.
-
-    ``asker`` is the same for all questions of a client that awaits each answer, through whichever socket; empty = not
-    known. Nobody waits for the answer after ``waits_s``.
-    """
+    """What every question has; ``AnswerT`` answers it. ``asker`` is the same for all questions of a client that awaits
+    each answer; empty = not known. Nobody waits for the answer after ``waits_s``."""
 
     takes_long: ClassVar[bool] = False  # more than a few milliseconds
     about_map: ClassVar[bool] = True  # answered from a snapshot, which has to be up to date
@@ -71,10 +67,7 @@ class Request(Wire, Generic[AnswerT], frozen=True, kw_only=True):
 
 
 class MapState(Wire, frozen=True):
-    """Which state of which map an answer is about.
-
-    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared.
-    """
+    """Which state of which map an answer is about. ``map_id`` is another one after the mapper was restarted."""
 
     map_id: Word
     version: Count
@@ -219,10 +212,7 @@ class ChangesRequest(Request[BlockChanges], frozen=True, kw_only=True):
 
 
 class CorrectPosesRequest(Request[Correction], frozen=True, kw_only=True):
-    """Move the map to corrected poses of its frames.
-
-    ``id`` makes it safe to send it again where an answer was lost: of requests with the same one, the first counts.
-    """
+    """Move the map to corrected poses of its frames. Of requests with the same ``id``, the first counts."""
 
     takes_long: ClassVar[bool] = True
     about_map: ClassVar[bool] = False
@@ -315,11 +305,8 @@ def encode_error(error: SemanticMapperError) -> list[bytes]:
 def decode_answer(name: str, kind: type[AnswerT], parts: Parts) -> tuple[MapState, AnswerT]:
     """Parts -> what the answer to question ``name`` is about, and the answer; its arrays are fresh and writable.
 
-    Raises:
-        MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.
-        TransportError: it answered with another one.
-        CodecError: anything that ``encode_answer`` would not have made, or an answer to another question.
-    """
+    ``MapError``, ``LabelError``, ``CodecError``, ``ShapeError``, ``PoseError``: the other side answered with this
+    error; ``TransportError``: with another one. ``CodecError``: no answer, or one to another question."""
     what = f"answer to '{name}'"
     actual = read_name(parts)
     header = unpack_header(parts[1], what, MAX_ANSWER_HEADER_BYTES)

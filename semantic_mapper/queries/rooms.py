@@ -1,9 +1,8 @@
 """Rooms of one floor: its plan, parted where it is as narrow as a door.
 
-Every cell of the plan climbs to the place near by that is farthest from the walls; the cells that end at one place are
-its basin. Two basins are one room where the passage between them is wider than a door, or hardly narrower than the
-smaller of the two (a corridor that is no wider than a door is one room, too). So rooms part at doors.
-"""
+Every cell of the plan climbs to the place near by that is farthest from the walls; cells that end at one place are its
+basin. Two basins are one room where the passage between them is wider than a door, or hardly narrower than the smaller
+of the two."""
 
 from __future__ import annotations
 

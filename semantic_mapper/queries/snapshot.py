@@ -1,9 +1,8 @@
 """One state of a map, which never changes, and mirrors that follow a map by its changes; all queries look at these.
 
 Neither needs Open3D or the map's own process. Blocks are written once, one behind the other, into a pool; a snapshot is
-a table of where its blocks lie. So a new snapshot costs its changed blocks and a new table, and an old one stays as it
-was. A full pool is replaced by a larger one with only the living blocks; the old pool goes when its last snapshot does.
-"""
+a table of where its blocks lie, so that an old one stays as it was. A full pool is replaced by a larger one with only
+the living blocks; the old pool goes when its last snapshot does."""
 
 from __future__ import annotations
 
@@ -107,11 +106,8 @@ class MapSnapshot:
         return self.truncation_voxels / TSDF_STEPS
 
     def changes(self, since: int, limit: int = 0) -> BlockChanges:
-        """As ``VoxelMap.changes``: what another mirror needs to follow this one.
-
-        Whole ``MapMirror.apply`` take the place of whole versions, so ``limit`` stops only between two of them. Raises
-        MapError: ``since`` is not a version of this map, or a negative ``limit``.
-        """
+        """As ``VoxelMap.changes``: what another mirror needs to follow this one. Whole ``MapMirror.apply`` take the
+        place of whole versions. ``MapError``: ``since`` is not a version of this map, or a negative ``limit``."""
         if not 0 <= since <= self.version or limit < 0:
             raise MapError(
                 f"changes since version {since}, limit {limit}: versions go from 0 to {self.version}, and a limit is "
@@ -150,10 +146,7 @@ class MapMirror:
 
     @classmethod
     def load(cls, path: Path) -> MapMirror:
-        """Mirror of a saved map, as ``of`` makes it of the loaded one, without its class evidence in memory.
-
-        Raises MapError: no such file, not a map, of another format version, or damaged (and what is).
-        """
+        """Mirror of a saved map, without its class evidence in memory; ``MapError`` as of ``VoxelMap.load``."""
         with open_map(path) as reader:
             config = reader.manifest.config
             mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
@@ -175,12 +168,11 @@ class MapMirror:
         return self._snapshot
 
     def apply(self, changes: BlockChanges) -> MapSnapshot:
-        """Take over changes and return the present state.
+        """Take over changes and return the present state; after a new epoch, the last one of the old epoch until all
+        has come.
 
-        After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
-        Raises MapError: changes that do not continue the mirror's version, or damaged ones. The mirror is as it was.
-        LabelError: a class id that is not in the label set. The mirror is as it was.
-        """
+        ``MapError``: changes that do not continue the mirror's version, or damaged ones; ``LabelError``: a class id
+        that is not in the label set. The mirror is as it was then."""
         packed = _check(changes, self._snapshot.label_set)
         with self._lock:
             old = self._next
@@ -287,8 +279,8 @@ class BlockAges:
         self._changed_s = np.empty(0, np.float64)
 
     def follow(self, snapshot: MapSnapshot, now_s: float) -> Float64:
-        """Seconds (B,) since each block of a snapshot, which is later than the last one, has changed, as seen here;
-        ``now_s`` is when the map was like this, on any one clock."""
+        """Seconds (B,) since each block of a snapshot, later than the last one, has changed, as seen here; ``now_s`` is
+        when the map was like this, on any one clock."""
         changed_s = np.full(snapshot.block_count, now_s)
         if len(self._packed):
             row = np.minimum(np.searchsorted(self._packed, snapshot.packed), len(self._packed) - 1)

@@ -1,9 +1,8 @@
 """The surface: its voxels, each with one point of it, and what a ray meets.
 
 A zero crossing of the TSDF on the edge between two observed voxels belongs to the nearer of the two (half way: to the
-lower). A voxel with crossings is a surface voxel; their mean is its surface point. So every surface point has the
-class, confidence and colour of its own voxel.
-"""
+lower). The mean of a voxel's crossings is its surface point, which has the class, confidence and colour of the
+voxel."""
 
 from __future__ import annotations
 
@@ -65,10 +64,8 @@ def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
 
 
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
-    """Surface points in a box with corners (3,), world metres, one a surface voxel, in a fixed order.
-
-    Raises MapError: a bad box.
-    """
+    """Surface points in a box with corners (3,), world metres, one a voxel, in a fixed order; ``MapError``: a bad
+    box."""
     low, high = check_box(lower, upper, snapshot)
     surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
     inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
@@ -96,14 +93,9 @@ class RayHits:
 
 
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
-    """The first surface that each ray meets from its front, at most ``max_m`` away (up to 100).
-
-    Raises MapError: bad arguments, or shapes that do not go together.
-
-    Args:
-        origins: (N, 3) or (3,) world metres.
-        directions: (N, 3) or (3,), of any length; one origin or direction stands for all.
-    """
+    """The first surface that each ray meets from its front, at most ``max_m`` away (up to 100). ``origins`` (world
+    metres) and ``directions`` (of any length) are (N, 3) or (3,), which stands for all. ``MapError``: bad arguments, or
+    shapes that do not go together."""
     check_positive(max_m, "max_m", MAX_RANGE_M)
     origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")
     direction = check_directions(directions, "directions")
@@ -130,9 +122,7 @@ def march_rays(
     slots: Int64,
     chosen: Int64,
 ) -> None:
-    """Write distances (N,), 0 = miss, and slot and voxel (N,) of the observed voxel nearest to each place that was hit,
-    among the eight round it; of those with votes if any has some.
-
-    Origins (N, 3) are in units of voxels, directions (N, 3) in voxels a unit of the distance, which ends at ``max_m``.
-    """
+    """Write distances (N,), 0 = miss, and slot and voxel (N,) of the observed voxel nearest to each hit, among the
+    eight round it; of those with votes if any has some. Origins (N, 3) are in units of voxels, directions (N, 3) in
+    voxels a unit of the distance, which ends at ``max_m``."""
     ...

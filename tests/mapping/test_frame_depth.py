@@ -27,7 +27,7 @@ from semantic_mapper.mapping.frame_depth import (
     computed_trust,
     rendered_trust,
 )
-from semantic_mapper.mapping.fusion import COMPUTED_CAP, COMPUTED_LOOK, MEASURED, SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.rendered_views import frame as posed
@@ -102,22 +102,17 @@ def test_computed_depth_is_shown_to_an_encoder_that_has_learned_from_it_and_to_n
     assert not torch.equal(computed, features(replace(frame, depth_m=None) if learned else frame))
 
 
-@pytest.mark.parametrize(("source", "computed"), [("auto", False), ("computed", True)])
-def test_depth_of_a_sensor_is_used_unless_the_pictures_are_asked_for(source: str, computed: bool) -> None:
+@pytest.mark.parametrize(
+    ("source", "computed"), [("auto", False), ("computed", True), ("sensor", False), ("off", False)]
+)
+def test_depth_of_a_sensor_is_used_unless_the_settings_say_otherwise(source: str, computed: bool) -> None:
     pipeline = make_pipeline(depth={"source": source})
     ready = [frame for f in walk()[:4] for frame in pipeline.prepare(f)]
     assert [frame.depth_sigma_m is not None for frame in ready] == [computed] * 4
     same = [np.array_equal(a.depth_m, b.depth_m) for a, b in zip(ready, walk(), strict=False)]
-    assert same == [not computed] * 4
-
-
-@pytest.mark.parametrize("source", ["sensor", "off"])
-def test_nothing_is_computed_where_the_settings_say_so(source: str) -> None:
-    pipeline = make_pipeline(depth={"source": source})
-    for frame in (walk()[0], *without_depth(walk()[1:3])):
-        (ready,) = pipeline.prepare(frame)
-        assert (ready.depth_m is None) == (frame.depth_m is None or source == "off")
-        assert ready.depth_sigma_m is None
+    assert same == [source in ("auto", "sensor")] * 4
+    (blind,) = pipeline.prepare(without_depth(walk()[4:5])[0])
+    assert (blind.depth_m is not None) == (source in ("auto", "computed"))
 
 
 def test_frames_that_wait_for_later_ones_come_once_and_in_order() -> None:
@@ -162,18 +157,6 @@ POSE = np.eye(4)
 
 def slanted() -> np.ndarray:
     return plane_depth(POSE, (0.2, 0.1, 1.0), 2.0)
-
-
-def test_any_number_of_computed_looks_weighs_less_than_one_measurement() -> None:
-    depth = slanted()
-    voxel_map = small_map()
-    for seq in range(40):
-        voxel_map.integrate(posed(seq=seq), depth, None, trust=np.full_like(depth, MOST_TRUST), measured=False)
-        if seq < 2:
-            assert voxel_map.block_state()["weight"].max() == (seq + 1) * COMPUTED_LOOK
-            assert bool(len(voxel_map.points().xyz)) == ((seq + 1) * COMPUTED_LOOK >= SURFACE_WEIGHT)
-    assert voxel_map.block_state()["weight"].max() == COMPUTED_CAP < MEASURED
-    assert not voxel_map.points().measured.any()
 
 
 def test_one_measurement_outweighs_all_that_was_computed_and_is_then_left_alone() -> None:

@@ -64,16 +64,6 @@ def test_open3d_sees_the_map_with_its_labels(sphere: VoxelMap) -> None:
         small_map().to_open3d()
 
 
-def test_depth_edge_is_not_bridged_by_a_false_surface() -> None:
-    depth = plane_depth(np.eye(4), (0, 0, 1), 1.5)
-    depth[:, :80] = 1.0  # a wall in front of a wall
-    voxel_map = small_map()
-    voxel_map.integrate(frame(), depth, None, None)
-    z = voxel_map.points().xyz[:, 2]
-    between = (z > 1.02) & (z < 1.48)
-    assert between.mean() < 0.005
-
-
 @pytest.mark.parametrize("min_weight", [0.1, 4.0])
 def test_crossings_are_those_of_a_dense_grid(min_weight: float, rng: np.random.Generator) -> None:
     index, buffers = random_grid(rng)

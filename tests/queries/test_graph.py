@@ -37,11 +37,6 @@ def test_two_rooms_a_door_and_a_table() -> None:
     assert draw_graph("house", graph).shape[2] == 3
 
 
-def test_a_wide_opening_parts_no_rooms() -> None:
-    graph = graph_of(two_rooms(door_m=1.6), GraphTracker())
-    assert len(graph.rooms) == 1 and not graph.doors and graph.rooms[0].area_m2 == pytest.approx(18.2, rel=0.1)
-
-
 def test_storeys_are_floors_of_their_own() -> None:
     graph = graph_of([*two_rooms(), *two_rooms(STOREY_M)], GraphTracker())
     assert [floor.height_m for floor in graph.floors] == pytest.approx([0.0, STOREY_M], abs=0.03)

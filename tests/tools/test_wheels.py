@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.wheels import LIBRARIES, ROOT, UV, elf_machine, find_problems
+from tools.wheels import LIBRARIES, ROOT, UV, find_problems
 
 GOOD = "semantic_mapper-0.1.0-py3-none-manylinux_2_28_aarch64.whl"
 DIGEST = "0123abcd"
@@ -44,10 +44,6 @@ def test_what_is_wrong_with_a_wheel_is_found(tmp_path: Path) -> None:
     assert problems(tmp_path, {path: library(183, "4567")}) == [f"{path} is compiled from other sources"]
     (wrong,) = problems(tmp_path, {path: library(183)}, "semantic_mapper-0.1.0-py3-none-linux_aarch64.whl")
     assert "py3-none-linux_aarch64" in wrong
-
-
-def test_the_machine_of_this_python_is_told() -> None:
-    assert elf_machine(Path(sys.executable).resolve().read_bytes()[:64]) in ("x86_64", "aarch64")
 
 
 @pytest.mark.slow
