@@ -6,7 +6,6 @@ rendered by the CPU (SwiftShader). The browser reaches this machine alone: every
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import platform
@@ -48,11 +47,7 @@ def provide_browser() -> str:
 
 
 class Browser:
-    """One page; a context manager.
-
-    Args:
-        width, height: Of the page in pixels.
-    """
+    """One page of this size in pixels; a context manager."""
 
     def __init__(self, width: int, height: int) -> None:
         self._size = width, height
@@ -60,7 +55,6 @@ class Browser:
         self._session = ""
         self._rest = b""
         self.requests: dict[str, str] = {}  # URLs that the page has asked for, by an id
-        self.refused: set[str] = set()  # ids of those that the page's own policy forbids
         self.messages: list[str] = []  # what it has said on its console
 
     def __enter__(self) -> Self:
@@ -104,10 +98,6 @@ class Browser:
         """Go to a page."""
         self._order("Page.navigate", url=url)
 
-    def screenshot(self) -> bytes:
-        """What the page shows, as PNG."""
-        return base64.b64decode(self._order("Page.captureScreenshot", format="png")["data"])
-
     def evaluate(self, script: str) -> Any:
         """Value of an expression of JavaScript in the page."""
         return self._order("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
@@ -124,13 +114,6 @@ class Browser:
         for place in places[1:]:
             self._mouse("mouseMoved", place, 1)
         self._mouse("mouseReleased", places[-1], 0)
-
-    def swipe(self, places: Sequence[tuple[float, float]]) -> None:
-        """Touch the first place with a finger, move over the others, and lift it."""
-        self._order("Emulation.setTouchEmulationEnabled", enabled=True)
-        for kind, place in (("touchStart", places[0]), *(("touchMove", p) for p in places[1:])):
-            self._order("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": place[0], "y": place[1]}])
-        self._order("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def press(self, *keys: str) -> None:
         """Press and release keys, one after the other, by the names that a page gets ("a", "ArrowUp")."""
@@ -182,8 +165,6 @@ class Browser:
         match message.get("method"):
             case "Network.requestWillBeSent":
                 self.requests[message["params"]["requestId"]] = message["params"]["request"]["url"]
-            case "Network.loadingFailed" if message["params"].get("blockedReason") == "csp":
-                self.refused.add(message["params"]["requestId"])
             case "Runtime.exceptionThrown":
                 details = message["params"]["exceptionDetails"]
                 self.messages.append(details.get("exception", {}).get("description", details["text"]))

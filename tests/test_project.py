@@ -15,7 +15,6 @@ import pytest
 import semantic_mapper
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("semantic_mapper", "drivers", "replay", "nodes")
 
 
 def pyproject() -> dict:

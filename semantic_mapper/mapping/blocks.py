@@ -117,7 +117,7 @@ class ScratchFile:
     def __init__(self, what: str, advice: str) -> None:
         self._what, self._advice = what, advice
         try:
-            self._database = sqlite3.connect("", check_same_thread=False, isolation_level=None)
+            self._database = sqlite3.connect("", check_same_thread=False)
             self._database.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
             self._database.execute("PRAGMA journal_mode = MEMORY")
             self._database.execute("CREATE TABLE blobs (key INTEGER PRIMARY KEY, crc INTEGER, blob BLOB)")
@@ -161,13 +161,8 @@ class ScratchFile:
     @contextmanager
     def _transaction(self, failure: str) -> Iterator[None]:
         try:
-            self._database.execute("BEGIN")
-            try:
+            with self._database:
                 yield
-                self._database.execute("COMMIT")
-            finally:
-                if self._database.in_transaction:  # some failures end it by themselves
-                    self._database.execute("ROLLBACK")
         except sqlite3.Error as error:
             raise MapError(
                 f"{failure}: {error}; make room in the folder for temporary files (TMPDIR), or {self._advice}"

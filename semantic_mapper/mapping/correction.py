@@ -383,10 +383,8 @@ class MapCorrector:
                 old = frame.T_world_camera if self._rebuild is None else self._rebuild.place(frame)
                 pairs.append(PosePair(frame.camera_id, stamp_ns, old, new.copy(), frame.world))
             elif not (self._left and stamp_ns < min(by_stamp, default=0)):
-                nearest = min(by_stamp, key=lambda stamp: abs(stamp - stamp_ns), default=None)
-                what = (
-                    "the history is empty" if nearest is None else f"of those in the history the nearest is {nearest}"
-                )
+                nearest = min(by_stamp, key=lambda stamp: abs(stamp - stamp_ns), default="none")
+                what = f"of those in the history the nearest is {nearest}"
                 raise MapError(f"{where}: no frame with this stamp was mapped; {what}")
         missing = len(poses) - len(pairs)
         if not pairs:
@@ -405,14 +403,12 @@ def _close(snapshots: Sequence[FrozenMap]) -> None:
 def _pack(arrays: Sequence[NDArray[np.generic] | None]) -> bytes:
     """Arrays as bytes, lossless: one plane for each byte of their values, as neighbouring ones are alike, and zstd."""
     packer = zstandard.ZstdCompressor(level=1)  # higher levels take several times as long for a few per cent
-    packed: list[tuple[str, tuple[int, ...], bytes] | None] = []
-    for array in arrays:
-        if array is None:
-            packed.append(None)
-            continue
+
+    def packed(array: NDArray[np.generic]) -> tuple[str, tuple[int, ...], bytes]:
         planes = np.ascontiguousarray(array).view(np.uint8).reshape(-1, array.itemsize).T
-        packed.append((array.dtype.str, array.shape, packer.compress(planes.tobytes())))
-    return msgspec.msgpack.encode(packed)
+        return array.dtype.str, array.shape, packer.compress(planes.tobytes())
+
+    return msgspec.msgpack.encode([None if array is None else packed(array) for array in arrays])
 
 
 def _unpack(blob: bytes) -> list[Any]:

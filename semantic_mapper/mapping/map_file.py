@@ -366,14 +366,11 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
     with _explained(f"{path}: cannot be read"):
         file.seek(-_END_BYTES, 2)
         end = file.read()
-    if not (end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:].startswith(_COMMENT)):
-        raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {ADVICE}")
-    if archive.comment != _comment(content):
-        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {ADVICE}")
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
     expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
-    if names != [*expected, _MANIFEST]:
-        raise MapError(f"{path}: damaged: arrays are missing, or others are there. {ADVICE}")
+    whole = end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:] == archive.comment == _comment(content)
+    if not whole or names != [*expected, _MANIFEST]:
+        raise MapError(f"{path}: damaged: it is cut off or changed, or arrays are missing. {ADVICE}")
     return manifest
 
 

@@ -20,7 +20,8 @@ _log = get_logger(__name__)
 @functools.cache
 def load_open3d() -> Any:
     """Import Open3D once and return the module, quiet; ``DependencyError`` says which library is missing."""
-    notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
+    folder = Path(sys.prefix) / "syslibs"
+    notes = _preload(_libusb() + sorted(p for p in folder.rglob("*.so*") if p.is_file()))
     try:
         open3d = importlib.import_module("open3d")
     except (ImportError, OSError, MemoryError) as error:
@@ -36,36 +37,26 @@ def load_open3d() -> Any:
     return open3d
 
 
-def preload_folder(folder: Path) -> list[str]:
-    """Load every shared library below ``folder`` into the process, in whatever order their links ask for; one line for
-    each that could not be."""
-    waiting = sorted(p for p in folder.rglob("*.so*") if p.is_file()) if folder.is_dir() else []
+def _preload(waiting: list[Path]) -> list[str]:
+    """Load shared libraries into the process, in whatever order their links ask for; a line for each that is not."""
     failures: dict[Path, str] = {}
     while waiting:
-        failures = {path: reason for path in waiting if (reason := _load_global(path))}
+        failures = {}
+        for path in waiting:
+            try:
+                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+            except OSError as error:
+                failures[path] = f"{path.name}: {error}"
         if len(failures) == len(waiting):  # no progress in a whole round: what is left cannot be loaded
             break
         waiting = list(failures)
-    return [f"{path.name}: {reason}" for path, reason in failures.items()]
+    return list(failures.values())
 
 
-def _load_global(path: Path) -> str:
-    """Empty where loaded, else the reason why not."""
+def _libusb() -> list[Path]:
+    """``libusb-1.0`` of its package, where there is one for this platform."""
     try:
-        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-    except OSError as error:
-        return str(error)
-    return ""
-
-
-def preload_libusb() -> list[str]:
-    """Load the wheel's ``libusb-1.0`` into the process; one line for why it could not be, empty where it was."""
-    try:
-        libusb_package = importlib.import_module("libusb_package")
-    except ImportError as error:
-        return [f"package libusb-package: {error}"]
-    path = libusb_package.get_library_path()
-    if path is None:
-        return ["package libusb-package carries no library for this platform"]
-    reason = _load_global(Path(path))
-    return [f"libusb: {reason}"] if reason else []
+        path = importlib.import_module("libusb_package").get_library_path()
+    except ImportError:
+        return []
+    return [] if path is None else [Path(path)]
