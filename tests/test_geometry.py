@@ -154,16 +154,6 @@ def test_scaled_intrinsics_see_the_same_corners_and_scale_back(
 # Rays
 
 
-def test_rays_by_hand() -> None:
-    T = torch.eye(4)
-    T[:3, 3] = torch.tensor([1.0, 2, 3])
-    rays = pixel_rays(torch.tensor([[10.0, 20], [110, 20], [10, 220]]), CAMERA, T, near_m=0.1, far_m=5)
-    torch.testing.assert_close(rays.direction, torch.tensor([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]))
-    torch.testing.assert_close(rays.origin, torch.tensor([[1.0, 2, 3]]).expand(3, 3))
-    assert rays.near_m.tolist() == pytest.approx([0.1] * 3) and rays.far_m.tolist() == [5] * 3
-    assert rays.prior_depth_m.tolist() == [0] * 3
-
-
 @given(camera=cameras(), T_world_camera=poses(), seed=st.integers(0, 1000))
 def test_every_point_of_a_ray_projects_to_its_pixel_at_its_depth(
     camera: CameraIntrinsics, T_world_camera: np.ndarray, seed: int

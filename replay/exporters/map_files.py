@@ -172,7 +172,7 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
         write_obj(path, mesh, scale_known=scale_known)
     else:
         up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), labels)
-        write_glb(path, mesh, labels, up, scale_known=scale_known)
+        write_glb(path, mesh, up, scale_known=scale_known)
         found = _found_up(request, up)
     return ExportReport((path,), f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
@@ -119,9 +120,15 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
             yield rows + start, blocks
 
 
-def oldest_first(versions: Int64, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the changed blocks (B,) come first: ascending positions of whole versions, at least one, else at most
-    ``limit`` blocks (0 = all); and the version that they complete, ``newest`` where it is all."""
+def oldest_first(versions: Int64, since: int, limit: int, newest: int) -> tuple[Int64, int]:
+    """Which of the blocks (B,) changed after ``since`` come first: ascending positions of whole versions, at least one,
+    else at most ``limit`` blocks (0 = all); and the version that they complete, ``newest``, the map's, where it is all.
+    ``MapError``: ``since`` is no version of the map, or ``limit`` is negative."""
+    if not 0 <= since <= newest or limit < 0:
+        raise MapError(
+            f"changes since version {since}, limit {limit}: this map has versions 0 to {newest}; a mirror of another "
+            "map restarts from 0, and a limit is not negative"
+        )
     if not limit or len(versions) <= limit:
         return np.arange(len(versions)), newest
     distinct, counts = np.unique(versions, return_counts=True)

@@ -2,11 +2,9 @@
 
 Files hold the world frame, in metres unless they say "scale: unknown"; one that cannot be written is a ``MapError``. Of
 PLY, ``comment label 3 chair`` says what the id 3 of ``label`` means; names are ASCII with Python's escapes. Where depth
-was computed somewhere, PLY and NPZ have ``measured``: 0 there, 1 where a sensor measured the surface.
-
-GLB (glTF 2.0) has y up: the mesh's node holds the rotation, vertices keep the coordinates of the world. COLOR_0 is
-linear light, 16 bits so that sRGB's 8 survive; _LABEL is the uint8 class id, _CONFIDENCE a float; ``extras.label_set``
-of the mesh says what the ids mean."""
+was computed somewhere, PLY and NPZ have ``measured``: 0 there, 1 where a sensor measured the surface. GLB (glTF 2.0)
+has y up: the mesh's node holds the rotation, vertices keep the coordinates of the world; colours are linear light, 16
+bits so that sRGB's 8 survive."""
 
 from __future__ import annotations
 
@@ -110,43 +108,32 @@ def write_obj(path: Path, mesh: MapMesh, *, scale_known: bool = True) -> None:
         file.writelines(b"f %d %d %d\n" % tuple(face) for face in (mesh.faces.astype(np.int64) + 1).tolist())
 
 
-_UINT8, _UINT16, _UINT32, _FLOAT = 5121, 5123, 5125, 5126
+_UINT16, _UINT32, _FLOAT = 5123, 5125, 5126
 _VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a part of the numbers is for
 
 
-def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
+def write_glb(path: Path, mesh: MapMesh, up: Float64, *, scale_known: bool = True) -> None:
     """Write a mesh as GLB; ``up`` (3,) is a unit vector, up in the world. ``MapError``: no faces, which glTF cannot
     hold, or more than 4 GiB."""
     if not len(mesh.faces):
         raise MapError(f"{path}: glTF cannot hold a mesh without faces")
-    labels = np.zeros((len(mesh.label), 4), np.uint8)
-    labels[:, 0] = mesh.label
     ends = {"min": mesh.vertices.min(axis=0).tolist(), "max": mesh.vertices.max(axis=0).tolist()}
-    scalar = {"type": "SCALAR"}
     parts: list[tuple[NDArray[Any], dict[str, Any], dict[str, Any]]] = [
         (mesh.vertices.astype("<f4"), _VERTICES, {"componentType": _FLOAT, "type": "VEC3", **ends}),
         (_linear_color(mesh.rgb), _VERTICES, {"componentType": _UINT16, "type": "VEC4", "normalized": True}),
-        (labels, {**_VERTICES, "byteStride": 4}, {"componentType": _UINT8, **scalar}),
-        (mesh.confidence.astype("<f4"), _VERTICES, {"componentType": _FLOAT, **scalar}),
-        (mesh.faces.astype("<u4").reshape(-1), _INDICES, {"componentType": _UINT32, **scalar}),
+        (mesh.faces.astype("<u4").reshape(-1), _INDICES, {"componentType": _UINT32, "type": "SCALAR"}),
     ]
     starts = np.cumsum([0, *(array.nbytes for array, _, _ in parts)]).tolist()  # multiples of four bytes, as glTF asks
     turn = np.eye(4)
     turn[:3, :3] = turn_onto(up, np.array((0.0, 1.0, 0.0)))
-    attributes = {"POSITION": 0, "COLOR_0": 1, "_LABEL": 2, "_CONFIDENCE": 3}
-    kept = ("name", "ids", "names", "colors", "ignore_id")
-    extras = {"label_set": {name: getattr(label_set, name) for name in kept}}
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0, "mode": 4}
     document = {
         "asset": {"version": "2.0", "generator": "semantic-mapper"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "world", "mesh": 0, "matrix": turn.T.reshape(-1).tolist()}],  # column by column
         "meshes": [
-            {
-                "name": "map",
-                "primitives": [{"attributes": attributes, "indices": 4, "material": 0, "mode": 4}],
-                "extras": extras if scale_known else {**extras, "scale": "unknown"},
-            }
+            {"name": "map", "primitives": [primitive], "extras": {} if scale_known else {"scale": "unknown"}},
         ],
         "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
         "accessors": [{"bufferView": n, "count": len(array), **a} for n, (array, _, a) in enumerate(parts)],

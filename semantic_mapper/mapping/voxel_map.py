@@ -376,13 +376,8 @@ class VoxelMap:
     def _choose_changes(self, since: int, limit: int, min_weight: float) -> CopiedChanges:
         """The changes; their blocks are read under the lock."""
         _check_min_weight(min_weight)
-        if not 0 <= since <= self.version or limit < 0:
-            raise MapError(
-                f"changes since version {since}, limit {limit}: this map has versions 0 to {self.version}; a mirror of "
-                "another map restarts from 0, and a limit is not negative"
-            )
         packed, changed_at = self._grid.versions_since(since)
-        rows, version = oldest_first(changed_at, limit, self.version)
+        rows, version = oldest_first(changed_at, since, limit, self.version)
         keys, cleared = unpack_keys(packed[rows]), self._cleared_rows.between(since, version)
         versions = since, version, self.version, self.epoch
         result = empty_changes(*versions, keys, scale_known=self.scale_known, cleared=cleared)

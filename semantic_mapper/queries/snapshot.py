@@ -108,13 +108,8 @@ class MapSnapshot:
     def changes(self, since: int, limit: int = 0) -> BlockChanges:
         """As ``VoxelMap.changes``: what another mirror needs to follow this one. Whole ``MapMirror.apply`` take the
         place of whole versions. ``MapError``: ``since`` is not a version of this map, or a negative ``limit``."""
-        if not 0 <= since <= self.version or limit < 0:
-            raise MapError(
-                f"changes since version {since}, limit {limit}: versions go from 0 to {self.version}, and a limit is "
-                "not negative; a mirror of another map restarts from version 0"
-            )
         later = np.flatnonzero(self.versions > since)
-        chosen, version = oldest_first(self.versions[later], limit, self.version)
+        chosen, version = oldest_first(self.versions[later], since, limit, self.version)
         rows = later[chosen]
         slots, voxels = self.slots[rows], self.voxels
         computed = (voxels.weight[slots] == COMPUTED).astype(np.uint8)

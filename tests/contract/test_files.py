@@ -17,7 +17,6 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore
 from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.replay.corrected_poses import read_corrections
-from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.online import KeyframePool
 from semantic_mapper.transport.keys import load_keys
@@ -154,17 +153,6 @@ def test_a_map_of_then_is_the_same_map(name: str, tmp_path: Path) -> None:
     assert (found["points"], found["labels"]) == (surface["points"], surface["labels"])
     for key in ("least", "most", "mean", "confidence"):
         np.testing.assert_allclose(found[key], surface[key], atol=POINT_M, rtol=0)
-
-
-@pytest.mark.parametrize("path", [MAP, MAP_COARSE], ids=lambda p: p.stem)
-def test_a_map_of_then_can_go_on(path: Path, tmp_path: Path) -> None:
-    voxel_map = VoxelMap.load(path)
-    with LogReader(LOG) as log:
-        frame = log.frame(8)
-    before = voxel_map.frames
-    assert frame.depth_m is not None and voxel_map.integrate(frame, frame.depth_m, None) > 0
-    voxel_map.save(tmp_path / "map.npz")
-    assert VoxelMap.load(tmp_path / "map.npz").frames == before + 1
 
 
 def test_what_a_killed_mapper_leaves_can_be_asked(tmp_path: Path) -> None:

@@ -32,8 +32,8 @@ POINTS = MapPoints(MESH.vertices, MESH.rgb, MESH.label, MESH.confidence)
 UP_Z = np.array((0.0, 0.0, 1.0))
 
 
-def read_glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """The JSON and the attributes and indices of the first primitive, with the checks that a strict reader makes."""
+def read_glb(path: Path) -> dict[str, np.ndarray]:
+    """The attributes and indices of the first primitive, with the checks that a strict reader makes."""
     data = path.read_bytes()
     magic, version, total = struct.unpack_from("<4sII", data)
     assert (magic, version, total) == (b"glTF", 2, len(data))
@@ -44,7 +44,7 @@ def read_glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     assert kind == b"BIN\0" and binary_size % 4 == 0 and 28 + size + binary_size == total
     binary = data[28 + size :]
     assert document["asset"]["version"] == "2.0" and document["buffers"] == [{"byteLength": binary_size}]
-    dtypes = {5121: np.uint8, 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+    dtypes = {5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
     widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
     (primitive,) = document["meshes"][0]["primitives"]
     assert primitive["mode"] == 4
@@ -62,7 +62,7 @@ def read_glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     assert position["min"] == out["POSITION"].min(axis=0).tolist()
     assert position["max"] == out["POSITION"].max(axis=0).tolist()
-    return document, out
+    return out
 
 
 def to_srgb(color: np.ndarray) -> np.ndarray:
@@ -70,18 +70,13 @@ def to_srgb(color: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
 
 
-def test_glb_holds_every_value_and_what_labels_mean_and_open3d_reads_it_with_y_up(tmp_path: Path) -> None:
-    write_glb(tmp_path / "map.glb", MESH, LABELS, UP_Z)
-    document, read = read_glb(tmp_path / "map.glb")
+def test_glb_holds_places_and_colours_and_open3d_reads_it_with_y_up(tmp_path: Path) -> None:
+    write_glb(tmp_path / "map.glb", MESH, UP_Z)
+    read = read_glb(tmp_path / "map.glb")
     np.testing.assert_array_equal(read["POSITION"], MESH.vertices)
     np.testing.assert_array_equal(read["indices"].reshape(-1, 3), MESH.faces)
     np.testing.assert_array_equal(to_srgb(read["COLOR_0"]), MESH.rgb)
     assert (read["COLOR_0"][:, 3] == 65535).all()
-    np.testing.assert_array_equal(read["_LABEL"], MESH.label)
-    np.testing.assert_array_equal(read["_CONFIDENCE"], MESH.confidence)
-    labels = document["meshes"][0]["extras"]["label_set"]
-    assert dict(zip(labels["ids"], labels["names"], strict=True)) == {5: "table", 9: "cup", 2: "wall"}
-    assert labels["ignore_id"] == 0 and [tuple(c) for c in labels["colors"]] == list(LABELS.colors)
     assert list(tmp_path.iterdir()) == [tmp_path / "map.glb"]
     model = load_open3d().io.read_triangle_model(str(tmp_path / "map.glb"))
     mesh = model.meshes[0].mesh

@@ -150,5 +150,5 @@ def test_only_what_changed_is_passed_on() -> None:
     first = source.snapshot().changes(0, limit=1)
     assert (first.since, first.version, len(first.keys)) == (0, 3, 2)
     for since, limit in ((-1, 0), (6, 0), (0, -1)):
-        with pytest.raises(MapError, match="go from 0 to 5"):
+        with pytest.raises(MapError, match="versions 0 to 5"):
             source.snapshot().changes(since, limit)
