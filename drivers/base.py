@@ -38,8 +38,7 @@ class CorrectedWorld:
 class CameraImage:
     """What a camera has captured, rectified: all of a ``PosedFrame`` but where the camera was."""
 
-    # stamp_ns, seq, camera_id, rgb, depth_m, intrinsics: As of ``PosedFrame``.
-    stamp_ns: int
+    stamp_ns: int  # this and those that follow as of ``PosedFrame``
     seq: int
     camera_id: str
     rgb: UInt8
@@ -65,12 +64,9 @@ class Camera:
     Iteration ends with a recording, never for a live camera. An image that is lost or damaged is passed over, and shows
     as a gap in ``seq``. A device that goes away and may come back is waited for within the driver; ``warnings`` says so
     meanwhile. What no waiting can fix raises ``CameraError``.
-
-    Attributes:
-        can_wait: Whether its images wait until they are taken, as those of a file do; known before it is open.
     """
 
-    can_wait = False
+    can_wait = False  # whether its images wait until they are taken, as those of a file do; known before it is open
 
     def __init__(self, camera_id: str) -> None:
         self._camera_id = camera_id
@@ -154,8 +150,5 @@ class PoseSource:
 
     def correction(self, final: bool = False) -> CorrectedWorld | None:
         """New poses of past images where a loop was closed, once after each change; to be called after each ``pose``.
-
-        Args:
-            final: No more images will come: finish what is under way.
-        """
+        ``final``: no more images will come: finish what is under way."""
         return None

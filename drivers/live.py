@@ -41,13 +41,9 @@ _log = get_logger(__name__)
 
 
 class Device:
-    """Base of an open device, used by one thread. Its constructor raises ``CameraError`` where it cannot be had.
+    """Base of an open device, used by one thread. Its constructor raises ``CameraError`` where it cannot be had."""
 
-    Attributes:
-        info: Its description, intrinsics and rate.
-    """
-
-    info: StreamInfo
+    info: StreamInfo  # its description, intrinsics and rate
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""Kinds of cameras by name. Each is a package ``drivers.<kind>`` that is loaded when it is requested.
+"""Kinds of cameras by name. Each is a module ``drivers.<kind>.camera`` that is loaded when it is requested.
 
-A package offers ``Config``, a ``msgspec.Struct``; ``open_camera(config, camera_id)``, a ``Camera`` that is not open yet
+It offers ``Config``, a ``msgspec.Struct``; ``open_camera(config, camera_id)``, a ``Camera`` that is not open yet
 (``CameraError``, ``ConfigError``: it cannot work with this config); and ``list_devices()``, a list of ``FoundCamera``
 (``CameraError``, ``DependencyError``: it cannot be searched for), which opens nothing for longer than a question.
 """
@@ -33,26 +33,20 @@ class FoundCamera:
 
 
 def load_driver(kind: str) -> Any:
-    """The package of a kind; ``ConfigError``: unknown, ``DependencyError``: something is not installed."""
+    """The module of a kind; ``ConfigError``: unknown, ``DependencyError``: something is not installed."""
     if kind not in KINDS:
         raise ConfigError(f"no kind of camera is called '{kind}'{nearest(kind, KINDS)}")
     try:
-        return importlib.import_module(f"semantic_mapper.drivers.{kind}")
+        return importlib.import_module(f"semantic_mapper.drivers.{kind}.camera")
     except ImportError as error:
         raise DependencyError(f"cameras of kind '{kind}' cannot be used here: {error}") from error
 
 
 def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str) -> Camera:
-    """A camera of a kind, not open yet.
+    """A camera of a kind, not open yet; ``config`` is plain data from ``where``, checked against the kind's ``Config``.
 
     Raises ConfigError, CameraError, DependencyError: a bad setting, one that cannot work, or something is not
     installed.
-
-    Args:
-        kind: Of ``KINDS``.
-        config: Plain data, checked against the ``Config`` of the kind.
-        camera_id: What its images will be called.
-        where: The config comes from, for messages.
     """
     driver = load_driver(kind)
     return driver.open_camera(convert_config(dict(config), driver.Config, where), camera_id)

@@ -193,8 +193,22 @@ def draw_calibration(camera_id: str, found: CameraCalibration) -> Figure:
     figure.suptitle(title, x=0.012, ha="left")
     grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
     _draw_residuals(figure.add_subplot(grid[:, 0]), found)
-    _draw_errors(figure.add_subplot(grid[0, 1]), found)
-    _draw_tilts(figure.add_subplot(grid[1, 1]), found)
+    errors, tilts = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
+    errors.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
+    errors.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=hex_color(GOOD))
+    errors.axhline(found.rms_px, color=hex_color(WARN), label=f"all corners: {found.rms_px:.2f}")
+    errors.locator_params(axis="x", integer=True)
+    errors.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
+    errors.legend(loc="upper right")
+    up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * MIN_TILT_DEG
+    tilts.plot(*square.T, color=hex_color(WARN), linewidth=1, label=f"needed: beyond {MIN_TILT_DEG:g}° each way")
+    tilts.plot(side, up, "o", color=hex_color(GOOD))
+    ticks = range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
+    tilts.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
+    tilts.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
+    tilts.legend(loc="upper center", handlelength=1)
     return figure
 
 
@@ -226,25 +240,3 @@ def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
     axes.set(xticks=(), yticks=(), xlim=x[[0, -1]], ylim=y[[-1, 0]], aspect="equal")
     note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
     axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
-
-
-def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
-    left_out = f", {len(found.left_out)} left out" if found.left_out else ""
-    axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
-    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=hex_color(GOOD))
-    axes.axhline(found.rms_px, color=hex_color(WARN), label=f"all corners: {found.rms_px:.2f}")
-    axes.locator_params(axis="x", integer=True)
-    axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
-    axes.legend(loc="upper right")
-
-
-def _draw_tilts(axes: Axes, found: CameraCalibration) -> None:
-    """How the board leaned in each view, and how far it has to have leaned at least once."""
-    up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
-    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * MIN_TILT_DEG
-    axes.plot(*square.T, color=hex_color(WARN), linewidth=1, label=f"needed: beyond {MIN_TILT_DEG:g}° each way")
-    axes.plot(side, up, "o", color=hex_color(GOOD))
-    ticks = range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
-    axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
-    axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
-    axes.legend(loc="upper center", handlelength=1)

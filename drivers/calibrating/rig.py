@@ -47,13 +47,8 @@ def solve(
 ) -> Calibration:
     """Calibrate cameras and, with ``rig``, find where they sit on it; the first one is where the rig is.
 
-    Raises CameraError: a result is not as ``config`` wants it; says why, and what to do.
-
-    Args:
-        gathered: By camera.
-        known: Cameras whose intrinsics are right as their source gives them.
-        config: What a result has to be like.
-        rig: See above.
+    The intrinsics of ``known`` cameras are right as their source gives them. Raises CameraError: a result is not as
+    ``config`` wants it; says why, and what to do.
     """
     cameras: dict[str, CameraCalibration] = {}
     for name, views in gathered.items():

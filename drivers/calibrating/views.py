@@ -53,11 +53,6 @@ class ViewGatherer:
     """Takes the images of one camera and keeps what calibration needs of them.
 
     With ``stream`` images follow each other closely: those that moved since the one before are left out.
-
-    Attributes:
-        images: How many were looked at; ``seen``: in how many the board was.
-        kept: Views for the intrinsics, each unlike the others; ``steady``: all in which the board stood still.
-        size: (width, height) of the images; intrinsics: what the source says of them. None before the first.
     """
 
     def __init__(self, board: BoardPoses, config: CalibrationConfig, *, stream: bool) -> None:
@@ -66,11 +61,11 @@ class ViewGatherer:
         self._stream = stream
         self._last: BoardView | None = None
         self._signatures: list[Float64] = []  # of the views that are kept
-        self.images = self.seen = 0
-        self.kept: list[BoardView] = []
-        self.steady: list[BoardView] = []
-        self.size: tuple[int, int] | None = None
-        self.intrinsics: CameraIntrinsics | None = None
+        self.images = self.seen = 0  # how many were looked at, and in how many the board was
+        self.kept: list[BoardView] = []  # for the intrinsics, each unlike the others
+        self.steady: list[BoardView] = []  # all in which the board stood still
+        self.size: tuple[int, int] | None = None  # width and height of the images
+        self.intrinsics: CameraIntrinsics | None = None  # what the source says of them
 
     def take(self, image: CameraImage, name: str = "") -> bool:
         """Look at an image; whether its view was kept. ``CameraError``: images of two sizes."""

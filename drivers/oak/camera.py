@@ -18,6 +18,7 @@ from semantic_mapper.drivers.base import CameraImage, as_camera_error
 from semantic_mapper.drivers.live import SLICE_S, Device, LiveCamera, first_of
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.device import Sources, capture_ns, clock_offset_ns, connect_device, synced_queue, take
+from semantic_mapper.drivers.oak.devices import list_devices as list_devices
 from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.drivers.oak.odometry import Odometry
 from semantic_mapper.errors import CameraError, FrameError, PoseError
@@ -100,9 +101,10 @@ class OakDevice(Device):
         image, odometry = self._waiting[0], self._odometry
         if odometry is not None:
             late = time.monotonic_ns() - image.stamp_ns > ODOMETRY_WAIT_S * 1e9
-            if not late and not odometry.reaches(image.stamp_ns):
+            found = odometry.at(image.stamp_ns)
+            if found in ("empty", "stale") and not late:
                 return None
-            image = replace(image, tracks_itself=True, own_pose=odometry.pose_at(image.stamp_ns))
+            image = replace(image, tracks_itself=True, own_pose=None if isinstance(found, str) else found)
         self._waiting.popleft()
         return image
 
@@ -110,14 +112,12 @@ class OakDevice(Device):
         """The next image, without its pose; None where it does not come within the time, or is damaged."""
         try:
             group = take(self._groups, timeout_s)
-            if group is None:
-                if self._sources.pipeline.isRunning():
-                    return None
-                raise EOFError
-        except EOFError as error:
-            raise CameraError(
-                f"{self._sources.name} has gone (unplugged, without power, or its firmware has crashed)"
-            ) from error
+        except EOFError:
+            group = None
+        if group is None:
+            if self._sources.pipeline.isRunning():
+                return None
+            raise CameraError(f"{self._sources.name} has gone (unplugged, without power, or its firmware has crashed)")
         rgb, depth = group["rgb"], group["depth"] if "depth" in self._sources.outputs else None
         try:
             pixels = rgb_pixels(rgb)

@@ -15,7 +15,7 @@ import numpy as np
 from semantic_mapper.drivers.base import PoseEstimate
 from semantic_mapper.drivers.live import SLICE_S
 from semantic_mapper.drivers.oak.device import OdometryPorts, capture_ns, clock_offset_ns, synced_queue, take
-from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
+from semantic_mapper.drivers.poses.motion import Miss, PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.geometry import check_pose, pose_matrix
 from semantic_mapper.types import Float64
@@ -58,18 +58,11 @@ class Odometry:
         self._thread = threading.Thread(target=self._run, name="oak-odometry", daemon=True)
         self._thread.start()
 
-    def reaches(self, stamp_ns: int) -> bool:
-        """Whether the poses go as far as this moment: waiting longer brings nothing new for it."""
-        with self._lock:
-            return self._track.newest_ns >= stamp_ns
-
-    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        """Pose of the colour camera at a moment between two poses; None outside of the known poses."""
+    def at(self, stamp_ns: int) -> PoseEstimate | Miss:
+        """Pose of the colour camera at a moment between two poses, or why it is missing."""
         with self._lock:
             found = self._track.at(stamp_ns)
-        if isinstance(found, str):
-            return None
-        return PoseEstimate(found.T @ self._T_left_rgb, "vio", world=self._world)
+        return found if isinstance(found, str) else PoseEstimate(found.T @ self._T_left_rgb, "vio", world=self._world)
 
     def close(self) -> None:
         """End, once the pipeline has ended."""

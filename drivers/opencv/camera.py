@@ -15,12 +15,18 @@ from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import require_calibration
 from semantic_mapper.drivers.live import NOT_CALIBRATED, CaptureDevice, LiveCamera, StreamClock
 from semantic_mapper.drivers.opencv.config import Config
+from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.types import CameraIntrinsics
 
 _log = get_logger(__name__)
+
+
+def list_devices() -> list[FoundCamera]:
+    """None: files and URLs are named, not found."""
+    return []
 
 
 def open_camera(config: Config, camera_id: str = "camera") -> Camera:

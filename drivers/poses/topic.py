@@ -28,11 +28,6 @@ _POLL_MS = 50
 # A pose cannot be of a moment that has not come. So much is left to publishers that predict where the robot will be
 # when the message arrives, and to an offset between two clocks that is not exact.
 _FUTURE_NS = 50_000_000
-_MISSES = {
-    "before": "is older than the poses that are kept",
-    "gap": "falls into a gap between two poses",
-    "stale": "is too far ahead of the newest pose",
-}
 _CLOCKS = "stamp poses with CLOCK_MONOTONIC of this machine, or set clock_offset_ns if the difference is constant"
 
 _log = get_logger(__name__)
@@ -112,14 +107,11 @@ class TopicPoseSource(PoseSource):
         if isinstance(found, StampedPose):
             self._image_trouble = ""
             return PoseEstimate(found.T @ self._mount, "topic", found.sigma)
-        if found == "empty" and self._message_trouble:
-            trouble = f"no pose that came from {endpoint} could be used"
-        elif found == "empty":
-            trouble = f"no pose has come from {endpoint}; is its publisher running?"
-        else:
+        trouble = f"no pose that can be used has come from {endpoint}; is its publisher running?"
+        if found != "empty":
             trouble = (
-                f"the last image of '{image.camera_id}' {_MISSES[found]} of {endpoint}: the newest one is "
-                f"{(stamp_ns - newest_ns) / 1e9:.3f} s older; if both are of different clocks, {_CLOCKS}"
+                f"no pose of {endpoint} is of the time of the last image of '{image.camera_id}' ({found}): the newest "
+                f"is {(stamp_ns - newest_ns) / 1e9:.3f} s older; if both are of different clocks, {_CLOCKS}"
             )
         if not self._image_trouble:
             _log.warning("image_without_pose", reason=found, detail=trouble)

@@ -54,9 +54,7 @@ _log = get_logger(__name__)
 class VisualPoseSource(PoseSource):
     """Follows one camera by its pictures. Not for several threads at once, but any may read ``counters``, ``warnings``.
 
-    Args:
-        config: How.
-        reference: Coarse poses of the same camera in metres that the scale comes from; None without.
+    The scale comes from ``reference``, coarse poses of the same camera in metres, where there is one.
 
     Attributes:
         counters: "tracked" images, "lost" ones, "waiting" ones before the world began, "relocalised", "keyframes",
@@ -203,10 +201,6 @@ class _Place:
 class VisualOdometry:
     """Follows one camera. The world begins at the first of the two views that begin it, and its unit is the median
     depth of what they see, until ``rescale`` sets another. ``counters`` are those of ``VisualPoseSource``.
-
-    Attributes:
-        keyframe_added: Whether the last image became a keyframe.
-        lost: Whether the last image was lost.
     """
 
     def __init__(self, intrinsics: CameraIntrinsics, counters: Counter[str]) -> None:
@@ -218,8 +212,8 @@ class VisualOdometry:
         self._places: list[_Place] = []
         self._next_try = 0
         self._past: list[tuple[int, Float64]] = []  # the last two poses
-        self.lost = False
-        self.keyframe_added = False
+        self.lost = False  # of the last image
+        self.keyframe_added = False  # whether the last image became one
 
     def push(self, rgb: UInt8, stamp_ns: int) -> Float64 | None:
         """Pose T_world_camera (4, 4) of the next image (H, W, 3); None while the world has not begun, or while lost."""

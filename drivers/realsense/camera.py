@@ -15,6 +15,7 @@ from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.drivers.live import SLICE_S, Device, LiveCamera, StreamClock, first_of
 from semantic_mapper.drivers.realsense.config import Config
 from semantic_mapper.drivers.realsense.devices import about, find_device, load_realsense
+from semantic_mapper.drivers.realsense.devices import list_devices as list_devices
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64

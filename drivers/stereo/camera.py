@@ -16,6 +16,7 @@ from semantic_mapper.drivers.live import NOT_CALIBRATED
 from semantic_mapper.drivers.stereo.config import Config
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.drivers.v4l2 import devices
+from semantic_mapper.drivers.v4l2.devices import list_stereo as list_devices  # noqa: F401 -- see the registry
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import UInt8
 
@@ -23,7 +24,7 @@ _OURS = ("device", "calibration", "uncalibrated", "width", "height")  # of the d
 
 
 class StereoCamera(Camera):
-    """The left camera of a pair, with depth."""
+    """The left camera of a pair, with depth; opened when it is entered."""
 
     def __init__(self, config: Config, camera_id: str) -> None:
         where = f"stereo pair at {config.device}"
@@ -109,6 +110,4 @@ def halves(rgb: UInt8, *, swapped: bool = False) -> tuple[UInt8, UInt8]:
     return (second, first) if swapped else (first, second)
 
 
-def open_camera(config: Config, camera_id: str) -> StereoCamera:
-    """The camera of a config, opened when it is entered; see ``drivers/registry.py``."""
-    return StereoCamera(config, camera_id)
+open_camera = StereoCamera

@@ -28,13 +28,8 @@ LEAST_OVERLAP = 0.5  # of the width may be lost to rectification
 class StereoDepth:
     """Makes rectified images, at most ``width`` pixels wide, and depth of pairs.
 
-    Raises ConfigError: the cameras are not side by side, or look apart, or the depths are out of reach.
-
-    Attributes:
-        intrinsics: Of the rectified left camera.
-        T_left_rectified: (4, 4) from it to the left camera: a turn by a degree or so, which makes the image planes one.
-        baseline_m: Between the cameras.
-        disparities: How many are searched.
+    ``intrinsics`` are those of the rectified left camera, which is turned by a degree or so, so that the image planes
+    are one. Raises ConfigError: the cameras are not side by side, or look apart, or the depths are out of reach.
     """
 
     def __init__(self, pair: StereoCalibration, width: int, min_depth_m: float, max_depth_m: float) -> None:
@@ -63,7 +58,7 @@ class StereoDepth:
             cv2.initUndistortRectifyMap(K, lens, R, P, size, cv2.CV_16SC2)
             for (K, lens), R, P in zip(lenses, (R_left, R_right), (P_left, P_right), strict=True)
         ]
-        self.T_left_rectified = np.eye(4)
+        self.T_left_rectified = np.eye(4)  # from the rectified left camera to the left one
         self.T_left_rectified[:3, :3] = np.asarray(R_left).T
         focal = float(P_left[0, 0])
         try:

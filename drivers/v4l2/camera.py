@@ -15,6 +15,7 @@ from semantic_mapper.drivers.calibration import require_calibration
 from semantic_mapper.drivers.live import CaptureDevice, LiveCamera
 from semantic_mapper.drivers.v4l2.config import Config
 from semantic_mapper.drivers.v4l2.devices import SHOWN_FORMATS, stable_path
+from semantic_mapper.drivers.v4l2.devices import list_devices as list_devices
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics
 

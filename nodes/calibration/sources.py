@@ -152,15 +152,11 @@ def _log_images(path: Path) -> Iterator[tuple[str, CameraImage]]:
 
 
 class Gathering:
-    """The views of all cameras.
-
-    Attributes:
-        cameras: By name, in the order in which they came; ``known``: those whose intrinsics are right as given.
-    """
+    """The views of all cameras."""
 
     def __init__(self, board: BoardPoses, config: CalibrationConfig) -> None:
-        self.cameras: dict[str, ViewGatherer] = {}
-        self.known: set[str] = set()
+        self.cameras: dict[str, ViewGatherer] = {}  # by name, in the order in which they came
+        self.known: set[str] = set()  # cameras whose intrinsics are right as given
         self._board = board
         self._config = config
         self._mutex = threading.Lock()

@@ -23,7 +23,10 @@ def test_an_unknown_kind_is_told_with_those_that_there_are(kind: str, says: str)
 def test_a_kind_that_cannot_be_used_or_searched_for_says_so_and_the_others_are_listed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    broken, whole = ModuleType("semantic_mapper.drivers.realsense"), ModuleType("semantic_mapper.drivers.v4l2")
+    broken, whole = (
+        ModuleType("semantic_mapper.drivers.realsense.camera"),
+        ModuleType("semantic_mapper.drivers.v4l2.camera"),
+    )
 
     def cannot() -> list[FoundCamera]:
         raise CameraError("the bus is gone")
@@ -32,7 +35,7 @@ def test_a_kind_that_cannot_be_used_or_searched_for_says_so_and_the_others_are_l
     vars(broken)["list_devices"] = cannot
     vars(whole)["list_devices"] = lambda: [camera]
     for name, module in (("oak", None), ("realsense", broken), ("v4l2", whole)):  # None: its import fails
-        monkeypatch.setitem(sys.modules, f"semantic_mapper.drivers.{name}", module)
+        monkeypatch.setitem(sys.modules, f"semantic_mapper.drivers.{name}.camera", module)
     with pytest.raises(DependencyError, match="kind 'oak' cannot be used here"):
         load_driver("oak")
     found, unknown = find_cameras(("oak", "realsense", "v4l2"))

@@ -14,7 +14,8 @@ import pytest
 
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.registry import open_camera
-from semantic_mapper.drivers.v4l2 import ioctls, list_devices
+from semantic_mapper.drivers.v4l2 import ioctls
+from semantic_mapper.drivers.v4l2.devices import list_devices
 from semantic_mapper.errors import CameraError, ConfigError
 from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine
 from tests.drivers.support import PATIENCE_S, until, write_calibration

@@ -23,7 +23,8 @@ FINE = 2  # rendered this much larger, then averaged, as a sensor does
 
 @cache
 def _sheet(board: BoardPoses) -> UInt8:
-    size = (board.columns * SQUARE_PX + 2 * MARGIN, board.rows * SQUARE_PX + 2 * MARGIN)
+    gap = 0 if board.pattern == "charuco" else 1 - board.marker_m / board.square_m
+    size = [round((count - gap) * SQUARE_PX) + 2 * MARGIN for count in (board.columns, board.rows)]
     return np.asarray(make_board(board).generateImage(size, marginSize=MARGIN), np.uint8)
 
 

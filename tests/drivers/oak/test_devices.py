@@ -8,8 +8,8 @@ import depthai as dai
 import pytest
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.drivers import oak
 from semantic_mapper.drivers.oak import devices
+from semantic_mapper.drivers.oak.camera import open_camera
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.errors import CameraError, ConfigError
@@ -33,7 +33,7 @@ def found(monkeypatch: pytest.MonkeyPatch, *infos: dai.DeviceInfo) -> None:
 
 def test_devices_are_listed_and_the_only_free_one_needs_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     found(monkeypatch, info("X_LINK_UNBOOTED"))
-    assert oak.list_devices() == [FoundCamera("oak", "18443010D1", "18443010D1", "usb/vsc 3.17, unbooted")]
+    assert devices.list_devices() == [FoundCamera("oak", "18443010D1", "18443010D1", "usb/vsc 3.17, unbooted")]
     assert devices.find_device("").getDeviceId() == "18443010D1"
     found(monkeypatch, info("X_LINK_UNBOOTED"), info("X_LINK_UNBOOTED", name="3.18"))
     with pytest.raises(CameraError, match=r"several OAK cameras are connected: 18443010D1 \(3\.17\), 18443010D1"):
@@ -46,7 +46,7 @@ def test_devices_are_listed_and_the_only_free_one_needs_no_name(monkeypatch: pyt
 @pytest.mark.parametrize("device", ["192.0.2.1", "FFFFFFFFFFFFFFFF"])  # an address and an id that nothing has
 def test_a_device_that_is_not_there_is_an_error_that_helps(device: str) -> None:
     says = f"the OAK '{device}' is not connected.*PoE.*firewall.*udevadm"
-    with pytest.raises(CameraError, match=says), oak.open_camera(Config(device=device), "front"):
+    with pytest.raises(CameraError, match=says), open_camera(Config(device=device), "front"):
         pass
 
 

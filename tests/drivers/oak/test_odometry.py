@@ -75,7 +75,9 @@ def test_images_carry_the_pose_of_their_moment(calibration: Path) -> None:
         np.testing.assert_allclose(image.own_pose.T_world_camera, expected, atol=1e-4)
 
 
-def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_do_not_wait_for_ever_and_a_lost_track_is_told(
+    calibration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(odometry, "ANSWER_S", 0.2)
     monkeypatch.setattr(camera_module, "ODOMETRY_WAIT_S", 0.1)
     go_on = threading.Event()
@@ -90,6 +92,11 @@ def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.Monk
         assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.warnings)
         go_on.set()
     assert not with_pose(images)
+    lost = dai.TransformData(float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=WAITS)
+    with camera:
+        assert not with_pose(list(itertools.islice(camera, 20)))
+        assert any("lost track" in trouble for trouble in camera.warnings)
 
 
 def test_after_a_reconnection_poses_are_of_another_world(calibration: Path) -> None:
@@ -101,15 +108,6 @@ def test_after_a_reconnection_poses_are_of_another_world(calibration: Path) -> N
         images = with_pose(list(itertools.islice(camera, 70)))
     worlds = [image.own_pose.world for image in images if image.own_pose is not None]
     assert len(set(worlds)) == 2 and worlds == sorted(worlds) and min(worlds) > 0
-
-
-def test_a_lost_track_is_told(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_module, "ODOMETRY_WAIT_S", 0.1)
-    lost = dai.TransformData(float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=WAITS)
-    with camera:
-        assert not with_pose(list(itertools.islice(camera, 20)))
-        assert any("lost track" in trouble for trouble in camera.warnings)
 
 
 def test_an_exception_while_tracking_is_told_and_the_camera_opened_again(calibration: Path) -> None:

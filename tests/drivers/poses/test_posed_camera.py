@@ -59,14 +59,18 @@ def run(camera: PosedCamera) -> list[int]:
 
 def test_frames_carry_the_image_and_the_pose_with_its_source_and_uncertainty() -> None:
     device = [image(7, seq=3, own=rigid((0, 0.1, 0), (1, 2, 3)))]
-    camera = PosedCamera(ListCamera(device), DevicePoseSource())
-    with camera:
+    with PosedCamera(ListCamera(device), DevicePoseSource()) as camera:
         (frame,) = camera
     assert (frame.stamp_ns, frame.seq, frame.camera_id) == (7, 3, "cam")
     assert (frame.pose_source, frame.pose_sigma) == ("vio", 0.01)
     assert np.array_equal(frame.T_world_camera, rigid((0, 0.1, 0), (1, 2, 3))) and frame.label is None
     assert frame.rgb is device[0].rgb and frame.depth_m is device[0].depth_m
     assert camera.info.source == "list" and camera.counters["frames"] == 1
+    rows = tuple(tuple(row) for row in rigid((0, 1, 0), (3, 2, 1)).tolist())
+    with PosedCamera(ListCamera(images(9)), FixedPoseSource(FixedPose(T_world_camera=rows))) as camera:
+        first = next(iter(camera))  # a pose of the settings is believed at once
+    assert (first.seq, first.pose_source) == (0, "fixed") and camera.counters["frames"] == 1
+    assert np.allclose(first.T_world_camera, rigid((0, 1, 0), (3, 2, 1)))
 
 
 @pytest.mark.parametrize(
@@ -165,26 +169,14 @@ def test_camera_and_poses_are_opened_stopped_and_freed_together() -> None:
     assert not source.is_open
 
 
-def test_a_camera_that_does_not_track_itself_is_refused_with_the_ways_out() -> None:
-    camera = PosedCamera(ListCamera(images(2)), DevicePoseSource())
-    with pytest.raises(CameraError, match=r"no pose of its own.*kind = \"topic\".*kind = \"board\""):
-        run(camera)
-
-
 def test_a_device_that_tracks_itself_may_take_as_long_for_its_first_pose_as_it_needs() -> None:
     quiet = [replace(unposed, tracks_itself=True) for unposed in images(40)]
     camera = PosedCamera(ListCamera([*quiet, image(5000 * MS, 40, own=np.eye(4))]), DevicePoseSource())
     assert run(camera) == [40] and camera.counters["no_pose"] == 40
     waits = PosedCamera(ListCamera(quiet), DevicePoseSource())
     assert run(waits) == [] and "does not know where it is" in waits.warnings[1]
-
-
-def test_a_fixed_camera_is_where_it_is_said_to_be_from_the_first_frame_on() -> None:
-    rows = tuple(tuple(row) for row in rigid((0, 1, 0), (3, 2, 1)).tolist())
-    with PosedCamera(ListCamera(images(9)), FixedPoseSource(FixedPose(T_world_camera=rows))) as camera:
-        first = next(iter(camera))
-    assert (first.seq, first.pose_source) == (0, "fixed") and camera.counters["frames"] == 1
-    assert np.allclose(first.T_world_camera, rigid((0, 1, 0), (3, 2, 1)))
+    with pytest.raises(CameraError, match=r"no pose of its own.*kind = \"topic\".*kind = \"board\""):
+        run(PosedCamera(ListCamera(images(2)), DevicePoseSource()))
 
 
 class ClosingLoops(Reported):

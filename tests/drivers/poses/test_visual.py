@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
-from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
-from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
+from semantic_mapper.drivers.poses.config import VisualPoses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource, two_views
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import look_at, project
 from semantic_mapper.nodes.camera.live import with_poses
@@ -142,18 +140,3 @@ def test_a_camera_that_only_turns_or_sees_one_plane_begins_no_world(rng: np.rand
     points[:, 2] = 2 + 0.3 * points[:, 0]
     wall = project(points, INTRINSICS), project(points - (0.3, 0.0, 0.0), INTRINSICS)
     assert two_views(*wall, INTRINSICS) is None
-
-
-def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
-    assert isinstance(make_poses(read_pose_config({"kind": "visual"})), VisualPoseSource) and begins_world(
-        VisualPoses()
-    )
-    source = make_poses(read_pose_config({"kind": "visual", "scale": {"kind": "board", "columns": 5}}))
-    assert isinstance(source, VisualPoseSource) and source.scale == "awaited"
-    for wrong, message in (
-        ({"scale": {"kind": "fixed"}}, 'must be "topic" or "board"'),
-        ({"scale": {"kind": "board", "colums": 5}}, "did you mean `columns`"),
-        ({"scale": {"kind": "board"}, "distance_m": 2.0}, "one of scale, distance_m and camera_height_m"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            read_pose_config({"kind": "visual", **wrong})

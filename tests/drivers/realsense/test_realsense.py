@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import textwrap
 import time
 from itertools import islice, pairwise
 from typing import Any
@@ -186,14 +183,3 @@ def test_connected_devices_are_listed_and_found_by_their_serial(monkeypatch: pyt
     assert devices.find_device(SERIAL) is soft
     with pytest.raises(CameraError, match="the RealSense '77' is not connected"):
         devices.find_device("77")
-
-
-def test_without_the_extra_it_is_named() -> None:
-    script = """
-    import sys
-    sys.modules["pyrealsense2"] = None
-    from semantic_mapper.drivers.registry import find_cameras
-    print(find_cameras(("realsense",))[1])
-    """
-    run = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
-    assert "pip install 'semantic-mapper[realsense]'" in run.stdout

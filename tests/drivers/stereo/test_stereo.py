@@ -14,8 +14,8 @@ from research.scenes import render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import load_stereo, save_stereo
 from semantic_mapper.drivers.registry import open_camera
-from semantic_mapper.drivers.stereo import list_devices
 from semantic_mapper.drivers.stereo.depth import StereoDepth
+from semantic_mapper.drivers.v4l2.devices import list_stereo
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.types import Float64
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
@@ -168,6 +168,6 @@ def test_cameras_that_offer_images_side_by_side_are_listed(machine: Machine) -> 
     machine.plug(Sensor(), 0)
     link = machine.plug(Sensor(card="Pair", sizes=((2560, 720), (1280, 720))), 1, link="usb-Pair-video-index0")
     machine.plug(Sensor(answers=False), 2, link="")
-    (found,) = list_devices()
+    (found,) = list_stereo()
     assert (found.kind, found.name, found.address) == ("stereo", "Pair", str(link))
     assert found.note == "video1; side by side 2560x720"
