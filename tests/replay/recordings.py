@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -188,34 +188,20 @@ def make_colmap(folder: Path, kind: str) -> Path:
     write_pictures(folder / "images", [f"{n}.png" for n in range(3)])
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
-    if kind == "txt":
-        (sparse / "cameras.txt").write_text(f"# Camera list\n1 SIMPLE_RADIAL {W} {H} {F} {W / 2} {H / 2} 0\n")
-        rows = []
-        for n, T in enumerate(poses()):
-            pose = invert_pose(T)
-            numbers = (*quaternion(pose[:3, :3]), *pose[:3, 3])
-            rows.append(f"{n + 1} {' '.join(map(repr, map(float, numbers)))} 1 {n}.png")
-            rows.append(" ".join(f"{10.5 + k} 20.5 {k + 1}" for k in range(3)) if n else "")
-        (sparse / "images.txt").write_text("# Image list\n" + "\n".join(rows) + "\n")
-        lines = [f"{k + 1} {x} {y} {z} 1 2 3 0.5 2 {k}" for k, (x, y, z) in enumerate(POINTS)]
-        (sparse / "points3D.txt").write_text("\n".join(lines) + "\n")
-        return folder
-    with (sparse / "cameras.bin").open("wb") as file:
-        file.write(struct.pack("<QiiQQ4d", 1, 1, 2, W, H, F, W / 2, H / 2, 0.0))
-    with (sparse / "images.bin").open("wb") as file:
-        file.write(struct.pack("<Q", 3))
-        for n, T in enumerate(poses()):
-            pose = invert_pose(T)
-            file.write(struct.pack("<i7di", n + 1, *quaternion(pose[:3, :3]), *pose[:3, 3], 1))
-            file.write(f"{n}.png".encode() + b"\0")
-            features = [(10.5 + k, 20.5, k + 1) for k in range(3)] if n else []
-            file.write(struct.pack("<Q", len(features)))
-            for feature in features:
-                file.write(struct.pack("<ddq", *feature))
-    with (sparse / "points3D.bin").open("wb") as file:
-        file.write(struct.pack("<Q", len(POINTS)))
-        for k, xyz in enumerate(POINTS):
-            file.write(struct.pack("<Q3d3BdQii", k + 1, *xyz, 1, 2, 3, 0.5, 1, 2, k))
+    (sparse / "cameras.txt").write_text(f"# Camera list\n1 SIMPLE_RADIAL {W} {H} {F} {W / 2} {H / 2} 0\n")
+    rows = []
+    for n, T in enumerate(poses()):
+        pose = invert_pose(T)
+        numbers = (*quaternion(pose[:3, :3]), *pose[:3, 3])
+        rows.append(f"{n + 1} {' '.join(map(repr, map(float, numbers)))} 1 {n}.png")
+        rows.append(" ".join(f"{10.5 + k} 20.5 {k + 1}" for k in range(3)) if n else "")
+    (sparse / "images.txt").write_text("# Image list\n" + "\n".join(rows) + "\n")
+    lines = [f"{k + 1} {x} {y} {z} 1 2 3 0.5 2 {k}" for k, (x, y, z) in enumerate(POINTS)]
+    (sparse / "points3D.txt").write_text("\n".join(lines) + "\n")
+    if kind == "bin":
+        importlib.import_module("pycolmap").Reconstruction(sparse).write_binary(sparse)
+        for file in (*sparse.glob("*.txt"), *sparse.glob("rigs.*"), *sparse.glob("frames.*")):
+            file.unlink()
     return folder
 
 

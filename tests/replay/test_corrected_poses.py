@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from structlog.testing import capture_logs
 
-from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
@@ -93,9 +92,3 @@ def test_what_cannot_correct_a_map_is_refused_by_name(tmp_path: Path) -> None:
     session = session_of(tmp_path, list(frames), history={"max_frames": 4})
     with pytest.raises(ImportSourceError, match=r"; [1-9]\d* frames have left the history \(history\.max_frames"):
         correct_session(session, trajectory)
-
-
-def test_the_history_holds_the_log_unless_the_config_says_otherwise() -> None:
-    assert keeping_frames(MapperConfig(), 500).history.max_frames > 500
-    given = convert_config({"history": {"max_frames": 20}}, MapperConfig, "test")
-    assert keeping_frames(given, 500) is given

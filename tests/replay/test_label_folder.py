@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -63,12 +64,9 @@ def test_a_folder_is_of_one_log_whatever_that_is_called(log: LogReader, tmp_path
     moved = tuple(dataclasses.replace(f, T_world_camera=f.T_world_camera + np.eye(4, k=3)) for f in tiny_frames(4))
     for name, frames in (("other", tiny_frames(4, seed=3)), ("moved", moved), ("short", tiny_frames(3))):
         with LogReader(write(tmp_path / f"{name}.mcap", frames)) as other:
-            for use in (
-                lambda other=other: open_label_folder(tmp_path / "labels", other),
-                lambda other=other: make_label_folder(tmp_path / "labels", other, ROOMS),
-            ):
+            for use in (open_label_folder, partial(make_label_folder, label_set=ROOMS)):
                 with pytest.raises(LogError, match=r"labels of another log, renamed\.mcap \(4 frames\)"):
-                    use()
+                    use(tmp_path / "labels", other)
 
 
 def test_classes_may_be_added_but_not_changed(log: LogReader, tmp_path: Path) -> None:
@@ -113,14 +111,11 @@ def test_classes_come_from_a_text_or_a_labels_json(tmp_path: Path) -> None:
     plain = tmp_path / "labels.json"
     plain.write_text(json.dumps({"classes": {"4": "mug", "9": "desk"}, "ignore": 255}))
     assert (read_classes(plain).ids, read_classes(plain).ignore_id) == ((4, 9), 255)
-    text.write_text("mug\nmug\n")
-    with pytest.raises(LabelError, match="twice"):
-        read_classes(text)
-    text.write_text("")
-    with pytest.raises(LabelError, match="no classes"):
-        read_classes(text)
-    text.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"kitchen\.txt"):
-        read_classes(text)
-    with pytest.raises(ConfigError, match=r"none\.txt"):
-        read_classes(tmp_path / "none.txt")
+    for wrong, error, says in (
+        (b"mug\nmug\n", LabelError, "twice"),
+        (b"", LabelError, "no classes"),
+        (b"\xff\xfe", ConfigError, r"kitchen\.txt"),
+    ):
+        text.write_bytes(wrong)
+        with pytest.raises(error, match=says):
+            read_classes(text)

@@ -107,7 +107,6 @@ def test_the_map_is_on_the_page_in_3d_with_a_legend(run: Path) -> None:
     boxes = [int(box.get("value") or 0) for box in page.iter("input") if box.get("type") == "checkbox"]
     label = np.frombuffer(base64.b64decode(data["label"]), np.uint8)
     assert sorted(boxes) == np.unique(label).tolist() == np.unique(points.label).tolist()
-    assert "viewport" in {meta.get("name") for meta in page.iter("meta")}
 
 
 def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> None:

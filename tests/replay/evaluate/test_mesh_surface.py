@@ -49,13 +49,11 @@ def test_walls_are_as_far_off_and_as_complete_as_they_are(wall_folder):
         assert wanted or abs(found["median_m"] - off_m) < 0.003
 
 
-def test_what_was_never_seen_is_not_complete_and_wrong_labels_score_zero(wall_folder):
+def test_what_was_never_seen_is_not_complete_wrong_labels_score_zero_and_no_mesh_is_named(wall_folder):
     write_wall(wall_folder / "mesh.npz", WALL_M, half=2.0, label=ROOMS.ids[1])
     found = compare_with_mesh(wall_folder, wall_folder / "mesh.npz")
     assert found["complete"] < found["complete_10cm"] < 0.5 and found["mesh_miou"] == 0.0
 
-
-def test_a_file_that_is_no_mesh_is_named(wall_folder):
     (wall_folder / "mesh.npz").write_bytes(b"nonsense")
     with pytest.raises(MapError, match=r"mesh\.npz"):
         compare_with_mesh(wall_folder, wall_folder / "mesh.npz")

@@ -2,15 +2,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.replay.sfm.features import find_features, loop_pairs
+from semantic_mapper.replay.sfm.colmap_process import loop_pairs
+from semantic_mapper.replay.sfm.film import find_features
 from semantic_mapper.types import UInt8
 
 
 def test_features_are_on_pixels_whose_centres_are_integers() -> None:
-    picture = np.zeros((80, 100, 3), np.uint8)
-    for y in range(80):
-        for x in range(100):
-            picture[y, x] = round(255 * np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 18))
+    y, x = np.mgrid[:80, :100]
+    blob = np.round(255 * np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 18)).astype(np.uint8)
+    picture = np.repeat(blob[..., None], 3, axis=2)
     xy, descriptors = find_features(picture)
     assert np.abs(xy - (40, 30)).max(axis=1).min() < 0.3 and descriptors.dtype == np.uint8
     assert len(find_features(np.zeros((80, 100, 3), np.uint8))[0]) == 0

@@ -93,26 +93,12 @@ def test_the_look_measures_motion_and_finds_blurred_and_dark_frames(tmp_path: Pa
     assert look.motion[1:4] == pytest.approx(2 / 128, rel=0.3)
 
 
-def look_of(motion: list[float], sharpness: list[float] | None = None, fast: list[float] | None = None) -> FilmLook:
-    count = len(motion)
-    return FilmLook(
-        np.arange(count),
-        np.arange(count) * 33_000_000,
-        np.array(motion),
-        np.array(motion if fast is None else fast),
-        np.array(sharpness or [1.0] * count),
-        np.zeros(count, np.bool_),
-    )
+def test_of_each_step_of_motion_the_sharpest_frame_is_picked_and_straight_ahead_the_edges_tell_the_step() -> None:
+    def look(motion: float, fast: float, count: int) -> FilmLook:
+        sharpness = np.resize([1.0, 1.1, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0], count)
+        number, same = np.arange(count), np.full(count, motion)
+        return FilmLook(number, number * 33_000_000, same, np.full(count, fast), sharpness, np.zeros(count, np.bool_))
 
-
-def test_of_each_step_of_motion_the_sharpest_frame_is_picked() -> None:
-    sharpness = [1.0, 1.1, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0]
-    look = look_of([0.0, *[0.011] * 7], sharpness)
-    assert pick_frames(look, step=0.04).tolist() == [1, 5]
-    still = look_of([0.0] * 8, sharpness)
-    assert pick_frames(still).tolist() == [5]
-
-
-def test_straight_ahead_the_edges_of_the_picture_tell_the_step() -> None:
-    sideways, ahead = look_of([0.01] * 41), look_of([0.01] * 41, fast=[0.03] * 41)
+    assert pick_frames(look(0.011, 0.011, 8)).tolist() == [1, 5] and pick_frames(look(0.0, 0.0, 8)).tolist() == [5]
+    sideways, ahead = look(0.01, 0.01, 41), look(0.01, 0.03, 41)
     assert len(pick_frames(sideways)) == 11 and len(pick_frames(ahead)) == 23

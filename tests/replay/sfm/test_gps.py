@@ -10,13 +10,7 @@ import pytest
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose, look_at
-from semantic_mapper.replay.sfm.gps import (
-    ORIGIN_KEY,
-    GpsPosition,
-    east_north_up,
-    place_by_gps,
-    read_position,
-)
+from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition, east_north_up, place_by_gps, read_position
 from semantic_mapper.types import Float64
 from tests.replay.recordings import ORIGIN, flight, imported, make_colmap, picture, positions_of, tag
 

@@ -58,13 +58,10 @@ def report(walked: Walked) -> FilmReport:
 def test_a_film_comes_out_as_it_was_walked(walked: Walked, report: FilmReport) -> None:
     error, _ = path_error_m(walked[0].with_suffix(".mcap"), walked[1])
     assert error < 0.01
-    note, frames = report.note, len(report.T_world_camera)
-    assert note.registered >= 0.95 * note.picked and frames >= 0.6 * COUNT
+    note, count = report.note, len(report.T_world_camera)
+    assert note.registered >= 0.95 * note.picked and count >= 0.6 * COUNT
     assert note.focal_px == pytest.approx(films.CAMERA.fx, rel=0.02) and note.error_px < 1.0
-    assert sum(note.left_out.values()) + frames == COUNT == note.frames
-
-
-def test_the_log_says_what_it_is(walked: Walked, report: FilmReport) -> None:
+    assert sum(note.left_out.values()) + count == COUNT == note.frames
     with LogReader(walked[0].with_suffix(".mcap")) as log:
         frames, attachments, info = list(log), log.attachments(), log.info
     assert info.source == "film room.mp4" and not info.scale_known and report.scale == ""
@@ -105,12 +102,6 @@ def test_options_that_cannot_be_are_refused_before_anything_is_read(tmp_path: Pa
     ):
         with pytest.raises((ConfigError, ImportSourceError), match=says):
             import_film(walked[0], tmp_path / "a.mcap", options, quiet)
-
-
-@pytest.mark.slow
-def test_the_same_film_gives_the_same_poses(tmp_path: Path, walked: Walked, report: FilmReport) -> None:
-    again = import_film(walked[0], tmp_path / "b.mcap", GUESS, quiet)
-    assert np.array_equal(again.T_world_camera, report.T_world_camera)
 
 
 @pytest.mark.slow
