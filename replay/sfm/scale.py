@@ -205,7 +205,6 @@ def marked_place(
 
 
 MIN_LENGTH = 0.06  # of an edge, of the image's width
-TRIALS = 2000  # of two edges each
 CONE_DEG = 40.0  # about the first guess: people hold cameras askew, and look down
 TOLERANCE_DEG = 1.5  # between an edge and the direction
 MIN_EDGES, MIN_SUPPORT = 40, 0.12  # of all edges' length: fewer upright ones are no evidence
@@ -246,12 +245,10 @@ def vertical(
         """Which planes (N, D) directions (3, D) lie in."""
         return np.abs(planes @ directions) < np.sin(np.radians(TOLERANCE_DEG))
 
-    guess = guess / np.linalg.norm(guess)
-    one, other = np.random.default_rng(0).choice(len(planes), (2, TRIALS), p=weight / weight.sum())
-    meeting = np.cross(planes[one], planes[other])
-    meeting *= np.sign(meeting @ guess)[:, None] / np.maximum(np.linalg.norm(meeting, axis=1), 1e-9)[:, None]
-    candidates = np.vstack((guess, meeting[meeting @ guess > np.cos(np.radians(CONE_DEG))]))
-    best = candidates[int(np.argmax(weight @ near(candidates.T)))]
+    best = guess / np.linalg.norm(guess)
+    for cone_deg, step_deg in ((CONE_DEG, 1.5), (1.5, 0.25)):
+        directions = _cone(best, cone_deg, step_deg)
+        best = directions[int(np.argmax(weight @ near(directions.T)))]
     for _ in range(5):
         agree = near(best)
         if agree.sum() < 8:
@@ -259,3 +256,16 @@ def vertical(
         _, axes = np.linalg.eigh((planes[agree] * weight[agree, None]).T @ planes[agree])
         best = axes[:, 0] * np.sign(axes[:, 0] @ best)
     return best if weight[near(best)].sum() > MIN_SUPPORT * weight.sum() else None
+
+
+def _cone(axis: Float64, half_deg: float, step_deg: float) -> Float64:
+    """Unit directions (N, 3) within an angle of an axis, about a step apart; the axis comes first."""
+    side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    side /= np.linalg.norm(side)
+    rows = [axis]
+    for tilt in np.radians(np.arange(step_deg, half_deg + 1e-9, step_deg)):
+        count = max(6, int(np.ceil(2 * np.pi * np.sin(tilt) / np.radians(step_deg))))
+        turn = np.arange(count)[:, None] * 2 * np.pi / count
+        ring = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+        rows += list(np.cos(tilt) * axis + np.sin(tilt) * ring)
+    return np.stack(rows)
