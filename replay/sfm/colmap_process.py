@@ -17,22 +17,10 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+import scipy  # loads `cluster` when it is first used
+from numpy.typing import NDArray
 
-from semantic_mapper.replay.sfm.colmap import (
-    FEATURES,
-    MIN_MODEL_IMAGES,
-    REQUEST,
-    RESULT,
-    UNKNOWN_FOCAL,
-    Attempt,
-    Camera,
-    FocalCheck,
-    Model,
-    Outcome,
-    Pair,
-    turn_fraction,
-)
-from semantic_mapper.replay.sfm.features import loop_pairs, match_features
+from semantic_mapper.replay.sfm import colmap
 from semantic_mapper.types import Bool, Float64, UInt8
 
 DATABASE = "database.db"
@@ -50,6 +38,11 @@ TURN_PX, TURN_FOCALS = 3.0, np.geomspace(0.4, 2.0, 12)  # off a turn at most, fo
 # that goes forwards. It begins with the widest, and halves the angle twice.
 AHEAD_MAX_FORWARD, AHEAD_ANGLE_DEG = 1.0, 8.0
 
+WORDS, TRAIN_ROWS, ROUNDS = 32, 20_000, 8  # of the vocabulary that the film's own features make
+LOOPS_A_FRAME = 3
+MAX_ANGLE, MAX_ANGLE_RATIO = 0.7, 0.8  # radians between two descriptors of one thing, and of the angle to the second
+MIN_SIMILARITY = 0.15  # of two frames that may show the same place; of two any frames it is about 0
+
 pycolmap: Any = import_module("pycolmap")
 pycolmap.logging.minloglevel = 3  # nothing but what ends the process
 
@@ -57,13 +50,13 @@ pycolmap.logging.minloglevel = 3  # nothing but what ends the process
 def main(folder: Path) -> None:
     """Match and map what is in a folder."""
     pycolmap.set_random_seed(SEED)
-    camera = msgspec.json.decode((folder / REQUEST).read_bytes(), type=Camera)
-    files = sorted((folder / FEATURES).glob("*.npz"))
+    camera = msgspec.json.decode((folder / colmap.REQUEST).read_bytes(), type=colmap.Camera)
+    files = sorted((folder / colmap.FEATURES).glob("*.npz"))
     descriptors = _fill_database(folder / DATABASE, camera, files)
     _match(folder, [file.stem for file in files], descriptors, camera.precision)
     verified = _verified(folder / DATABASE, camera)
-    turns = turn_fraction(verified, flat=True) >= 0.5
-    outcome = Outcome(_attempts(folder, camera, len(files), turns=turns), verified)
+    turns = colmap.turn_fraction(verified, flat=True) >= 0.5
+    outcome = colmap.Outcome(_attempts(folder, camera, len(files), turns=turns), verified)
     best = outcome.best
     if best.models:
         at = folder / best.models[0].folder
@@ -71,7 +64,7 @@ def main(folder: Path) -> None:
         known = camera.about and best.focal_prior_px == camera.focal_priors[0]
         sigma = _settle(at, camera, best.focal_prior_px, free=camera.fixed is None and not known)
         outcome = msgspec.structs.replace(outcome, focal=focal, focal_sigma=sigma)
-    (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
+    (folder / colmap.RESULT).write_bytes(msgspec.json.encode(outcome))
 
 
 def write_arrays(folder: Path, file: Path) -> None:
@@ -102,13 +95,13 @@ def write_arrays(folder: Path, file: Path) -> None:
     )
 
 
-def _attempts(folder: Path, camera: Camera, count: int, *, turns: bool) -> list[Attempt]:
+def _attempts(folder: Path, camera: colmap.Camera, count: int, *, turns: bool) -> list[colmap.Attempt]:
     """Until one has registered most frames; a camera that turns on the spot gets none that begins straight ahead.
 
     Straight ahead, the focal length is tried free. It is held only where that places next to nothing: two frames of a
     way without any turn fit all of them, and a wrong one that is held bends the path.
     """
-    attempts: list[Attempt] = []
+    attempts: list[colmap.Attempt] = []
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
         known = camera.about and number == 0
         for ahead, held in dict.fromkeys(((False, known), (True, known), (True, camera.fixed is None))):
@@ -118,13 +111,13 @@ def _attempts(folder: Path, camera: Camera, count: int, *, turns: bool) -> list[
             models = _map(folder, len(attempts), camera, prior, count, held=held, ahead=ahead)
             if known:
                 models = [_freed(folder, model, prior) for model in models]
-            attempts.append(Attempt(prior, models, ahead))
+            attempts.append(colmap.Attempt(prior, models, ahead))
             if models and models[0].images >= ENOUGH * count:
                 return attempts
     return attempts
 
 
-def _fill_database(path: Path, camera: Camera, files: list[Path]) -> list[UInt8]:
+def _fill_database(path: Path, camera: colmap.Camera, files: list[Path]) -> list[UInt8]:
     descriptors: list[UInt8] = []
     with pycolmap.Database.open(path) as database:
         camera_id = database.write_camera(_camera(camera, camera.focal_priors[0]))
@@ -145,7 +138,7 @@ def _fill_database(path: Path, camera: Camera, files: list[Path]) -> list[UInt8]
     return descriptors
 
 
-def _camera(camera: Camera, prior: float, *, held: bool = False) -> Any:
+def _camera(camera: colmap.Camera, prior: float, *, held: bool = False) -> Any:
     return pycolmap.Camera(
         model="SIMPLE_RADIAL" if camera.fixed is None else "PINHOLE",
         width=camera.width,
@@ -179,9 +172,63 @@ def _match(folder: Path, names: list[str], descriptors: list[UInt8], precision: 
     _report("match", len(pairs), len(pairs))
 
 
+def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:
+    """Rows (M, 2) of features (N, 128) that are each other's nearest, by angle, and clearly nearer than the second one.
+
+    Every feature is compared with every other one: COLMAP's search through an index differs now and then between runs.
+    Products of bytes are whole numbers below 2^24, so that the outcome is the same on any number of threads.
+    """
+    if min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), np.uint32)
+    alike = a.astype(np.float32) @ b.astype(np.float32).T
+    best = alike.argmax(axis=1)
+    rows = np.flatnonzero(alike.argmax(axis=0)[best] == np.arange(len(a)))
+    pairs = rows, best[rows]
+    near = alike[pairs]
+    alike[pairs] = -1  # what is left is the second nearest
+    second = np.maximum(alike[rows].max(axis=1), alike[:, best[rows]].max(axis=0))
+    angle, next_angle = (np.arccos(np.minimum(x / 512.0**2, 1.0)) for x in (near, second))
+    good = (angle < MAX_ANGLE) & (angle < MAX_ANGLE_RATIO * next_angle)
+    return np.stack((pairs[0][good], pairs[1][good]), axis=1).astype(np.uint32)
+
+
+def loop_pairs(descriptors: list[UInt8], window: int, seed: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of frames further than ``window`` apart that look alike, by their descriptors (N, 128).
+
+    Frames are compared by the sums of their descriptors' residuals to a few words (VLAD), learned from all of them.
+    """
+    filled = [rows for rows in descriptors if len(rows)]
+    if len(filled) <= window or sum(map(len, filled)) < 10 * WORDS:
+        return []
+    rng = np.random.default_rng(seed)
+    each = max(1, TRAIN_ROWS // len(filled))
+    sample = np.concatenate([rows[rng.permutation(len(rows))[:each]] for rows in filled]).astype(np.float64)
+    words, _ = scipy.cluster.vq.kmeans2(sample, WORDS, ROUNDS, minit="points", rng=rng)
+    signatures = np.stack([_signature(rows.astype(np.float64), words) for rows in descriptors])
+    signatures -= signatures.mean(axis=0)
+    signatures /= np.maximum(np.linalg.norm(signatures, axis=1, keepdims=True), 1e-9)
+    alike = signatures @ signatures.T
+    gap = np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike))))
+    alike[gap <= window] = -1
+    pairs: set[tuple[int, int]] = set()
+    for i, row in enumerate(alike):
+        best = np.argsort(-row, kind="stable")[:LOOPS_A_FRAME]
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] > MIN_SIMILARITY}
+    return sorted(pairs)
+
+
+def _signature(rows: Float64, words: Float64) -> Float64:
+    sums = np.zeros_like(words)
+    if len(rows):
+        nearest, _ = scipy.cluster.vq.vq(rows, words)
+        np.add.at(sums, nearest, rows - words[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-9)
+
+
 def _map(
-    folder: Path, number: int, camera: Camera, prior: float, count: int, *, held: bool, ahead: bool
-) -> list[Model]:
+    folder: Path, number: int, camera: colmap.Camera, prior: float, count: int, *, held: bool, ahead: bool
+) -> list[colmap.Model]:
     """Models of one attempt, the largest first; ``held``: the focal length stays; ``ahead``: see ``Attempt``."""
     with pycolmap.Database.open(folder / DATABASE) as database:
         database.update_camera(_camera(camera, prior, held=held))
@@ -189,7 +236,7 @@ def _map(
     mapper, triangulation, precision = options.mapper, options.triangulation, camera.precision
     options.random_seed = mapper.random_seed = triangulation.random_seed = SEED
     options.num_threads = mapper.num_threads = 1  # several threads add up in another order each time
-    options.min_model_size = MIN_MODEL_IMAGES
+    options.min_model_size = colmap.MIN_MODEL_IMAGES
     options.max_num_models = 6
     options.init_num_trials = INIT_TRIALS
     options.extract_colors = False
@@ -228,8 +275,10 @@ def _map(
     return sorted(models, key=lambda model: (-model.images, model.error_px))
 
 
-def _figures(folder: str, model: Any) -> Model:
-    return Model(folder, model.num_reg_images(), float(model.compute_mean_reprojection_error()), _focal_px(model))
+def _figures(folder: str, model: Any) -> colmap.Model:
+    return colmap.Model(
+        folder, model.num_reg_images(), float(model.compute_mean_reprojection_error()), _focal_px(model)
+    )
 
 
 def _focal_px(model: Any) -> float:
@@ -246,15 +295,11 @@ def _adjustment(**options: bool) -> Any:
     return found
 
 
-def _bundle(model: Any, **options: bool) -> None:
-    pycolmap.bundle_adjustment(model, _adjustment(**options))
-    model.update_point_3d_errors()
-
-
-def _freed(folder: Path, held: Model, prior: float) -> Model:
+def _freed(folder: Path, held: colmap.Model, prior: float) -> colmap.Model:
     """A model, adjusted with a free focal length; as it was where that runs away from the known one."""
     model = pycolmap.Reconstruction(folder / held.folder)
-    _bundle(model)
+    pycolmap.bundle_adjustment(model, _adjustment())
+    model.update_point_3d_errors()
     freed = _figures(held.folder, model)
     if abs(freed.focal_px / prior - 1) > MAX_FOCAL_CHANGE:
         return held
@@ -262,7 +307,7 @@ def _freed(folder: Path, held: Model, prior: float) -> Model:
     return freed
 
 
-def _check_focal(folder: Path) -> FocalCheck:
+def _check_focal(folder: Path) -> colmap.FocalCheck:
     """Adjust a model with its focal length as it is, then with a free one; the model on disk stays as it is.
 
     What the squared errors lose, over their mean, is the square of the difference in standard deviations.
@@ -270,15 +315,16 @@ def _check_focal(folder: Path) -> FocalCheck:
     model = pycolmap.Reconstruction(folder)
     errors, focal = list[float](), list[float]()
     for free in (False, True):
-        _bundle(model, refine_extra_params=False, refine_focal_length=free)
+        pycolmap.bundle_adjustment(model, _adjustment(refine_extra_params=False, refine_focal_length=free))
+        model.update_point_3d_errors()
         errors.append(_squared_px(model))
         focal.append(_focal_px(model))
     if errors[1] <= 0:
-        return FocalCheck(1.0, 0.0)
-    return FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] / errors[1] - 1) * _free_values(model)) ** 0.5)
+        return colmap.FocalCheck(1.0, 0.0)
+    return colmap.FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] / errors[1] - 1) * _free_values(model)) ** 0.5)
 
 
-def _settle(folder: Path, camera: Camera, prior: float, *, free: bool) -> float | None:
+def _settle(folder: Path, camera: colmap.Camera, prior: float, *, free: bool) -> float | None:
     """Adjust the model in a folder until it converges; the standard deviation of a free focal length, as a fraction.
 
     A covariance belongs to the minimum, and while it maps, COLMAP ends its adjustments before that. A focal length that
@@ -287,7 +333,7 @@ def _settle(folder: Path, camera: Camera, prior: float, *, free: bool) -> float 
     model = pycolmap.Reconstruction(folder)
     adjuster = _adjust(model, camera, free=free)
     sigma = _focal_sigma(model, camera, adjuster) if free and adjuster is not None else None
-    if sigma is not None and sigma > UNKNOWN_FOCAL:
+    if sigma is not None and sigma > colmap.UNKNOWN_FOCAL:
         model = pycolmap.Reconstruction(folder)
         lens = next(iter(model.cameras.values()))
         lens.params = [prior, *lens.params[1:]]
@@ -297,7 +343,7 @@ def _settle(folder: Path, camera: Camera, prior: float, *, free: bool) -> float 
     return sigma
 
 
-def _adjust(model: Any, camera: Camera, *, free: bool) -> Any | None:
+def _adjust(model: Any, camera: colmap.Camera, *, free: bool) -> Any | None:
     """Adjust a model until it converges, with the first two cameras held; what did it, None if it failed."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
@@ -310,7 +356,7 @@ def _adjust(model: Any, camera: Camera, *, free: bool) -> Any | None:
     return adjuster if usable else None
 
 
-def _focal_sigma(model: Any, camera: Camera, adjuster: Any) -> float | None:
+def _focal_sigma(model: Any, camera: colmap.Camera, adjuster: Any) -> float | None:
     """Standard deviation of the focal length as a fraction, 1 at most; None = unknown."""
     focal = _focal_px(model)
     if not FOCAL_RANGE[0] < focal / camera.size < FOCAL_RANGE[1]:
@@ -335,11 +381,11 @@ def _free_values(model: Any) -> int:
     return max(0, 2 * seen - 6 * model.num_reg_images() - 3 * len(model.points3D))
 
 
-def _verified(path: Path, camera: Camera) -> list[Pair]:
+def _verified(path: Path, camera: colmap.Camera) -> list[colmap.Pair]:
     """Pairs of frames near each other in the sequence, whose matches agree."""
     focals = TURN_FOCALS * camera.size if camera.fixed is None else np.array(camera.fixed[:1])
     centre = np.array((camera.width / 2, camera.height / 2) if camera.fixed is None else camera.fixed[2:])
-    pairs: list[Pair] = []
+    pairs: list[colmap.Pair] = []
     with pycolmap.Database.open(path) as database:
         ids = [image.image_id for image in sorted(database.read_all_images(), key=lambda image: image.name)]
         for i, j in _near_pairs(len(ids)):
@@ -353,10 +399,10 @@ def _verified(path: Path, camera: Camera) -> list[Pair]:
             cv2.setRNGSeed(SEED)
             _, mask = cv2.findHomography(a, b, cv2.RANSAC, 3.0)
             flat, turn = 0.0, 0.0
-            if mask is not None:
+            if mask is not None and mask.sum() >= 3:
                 flat = float(mask.mean())
                 turn = _turned(a - centre, b - centre, mask[:, 0] > 0, focals, TURN_PX * max(1.0, camera.size / 640))
-            pairs.append(Pair(i, j, len(matches), flat, turn))
+            pairs.append(colmap.Pair(i, j, len(matches), flat, turn))
     return pairs
 
 
@@ -366,8 +412,6 @@ def _turned(a: Float64, b: Float64, on: Bool, focals: Float64, limit_px: float) 
     ``a`` and ``b`` (N, 2) are pixels from the picture's centre in both frames; the turn is fitted to those ``on`` (N,).
     """
     best = 0.0
-    if on.sum() < 3:
-        return best
     for focal in focals.tolist():
         rays = [np.column_stack((xy, np.full(len(xy), focal))) for xy in (a, b)]
         rays = [r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays]

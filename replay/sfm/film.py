@@ -1,5 +1,5 @@
 """The frames of a film, or the pictures of a folder, in their order, with times; which of them are worth a look: sharp
-ones, a step of motion apart; and what a log keeps of its film."""
+ones, a step of motion apart; their features; and what a log keeps of its film."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from semantic_mapper.files import numeric_order
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.sfm.between import track
 from semantic_mapper.replay.sfm.gps import GpsPosition, read_exif, read_position
-from semantic_mapper.types import Bool, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -45,20 +45,14 @@ class Film:
 
     Frames are turned clockwise by ``quarters``, on top of what the film's own rotation mark says. Raises
     ImportSourceError: missing, no film that OpenCV can decode, or no pictures.
-
-    Attributes:
-        width, height: Of the frames as they are given, in pixels.
-        full_width, full_height: Before they were made smaller.
-        count: About how many there are; films may tell a wrong number.
-        focal_px: Focal length by the picture's EXIF data, for the given size; None where nothing tells it.
-        unread: Of a film that was read to its end: announced frames that cannot be decoded, or are not there.
-        odd_pictures: Of a folder: pictures that cannot be read or have another size, with the reason.
     """
 
     def __init__(self, path: Path, quarters: int = 0) -> None:
         self.path = path
-        self.odd_pictures: dict[Path, str] = {}
-        self.unread, self.count, self.hz = 0, 0, PICTURE_HZ
+        self.odd_pictures: dict[Path, str] = {}  # of a folder: those that cannot be read or have another size, and why
+        self.count = 0  # about how many frames there are; films may tell a wrong number
+        self.unread = 0  # of a film that was read to its end: announced frames that cannot be decoded, or are not there
+        self.hz = PICTURE_HZ
         self._turn = _TURNS[quarters % 4]
         self._pictures = pictures_of(path) if path.is_dir() else []
         if path.is_dir() and not self._pictures:
@@ -69,7 +63,7 @@ class Film:
         if first is None:
             raise ImportSourceError(f"{path}: holds no frame that can be decoded; copy or convert it again")
         index, _, bgr = first
-        self.full_height, self.full_width = bgr.shape[:2]
+        self.full_height, self.full_width = bgr.shape[:2]  # before they are made smaller
         ratio = min(1.0, MAX_SIDE_PX / max(bgr.shape[:2]))
         self.width, self.height = (max(1, round(side * ratio)) for side in (self.full_width, self.full_height))
         focal_px = focal_of_exif(self._pictures[index], bgr.shape[:2]) if self._pictures else None
@@ -233,6 +227,22 @@ def _motion(last: UInt8, now: UInt8) -> tuple[float, float]:
         return float("nan"), float("nan")
     median, fast = np.percentile(np.linalg.norm(moved - corners, axis=2)[true, 0], (50, 85)) / now.shape[1]
     return float(median), float(fast)
+
+
+MOST_FEATURES = 2500
+_CONTRAST = 0.02  # half of OpenCV's default: walls of rooms have little
+
+
+def find_features(bgr: UInt8) -> tuple[Float32, UInt8]:
+    """SIFT's pixels (N, 2) float32, centres of pixels being integers, and descriptors (N, 128) uint8 (square roots)."""
+    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=_CONTRAST)
+    keypoints, found = sift.detectAndCompute(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), None)
+    if found is None or not len(keypoints):
+        return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+    xy = np.array([k.pt for k in keypoints], np.float32)[:MOST_FEATURES]
+    rows = np.asarray(found, np.float32)[:MOST_FEATURES]
+    rooted = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
+    return xy, np.clip(np.round(512 * rooted), 0, 255).astype(np.uint8)
 
 
 FILM_ATTACHMENT = "film.json"

@@ -24,7 +24,6 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.sfm import colmap, refusals
 from semantic_mapper.replay.sfm.between import RegisteredFrame, follow_pose
-from semantic_mapper.replay.sfm.features import find_features
 from semantic_mapper.replay.sfm.film import (
     LEAST_MOTION,
     STEP,
@@ -32,6 +31,7 @@ from semantic_mapper.replay.sfm.film import (
     FilmFrame,
     FilmLook,
     FilmNote,
+    find_features,
     look_through,
     pick_frames,
 )

@@ -38,16 +38,12 @@ def refuse_look(film: object, look: FilmLook, picks: int) -> None:
             f"{film}: {100 * dark:.0f} % of its frames are black or show nothing; is the lens covered? {_HOW}"
         )
     way = float(np.nansum(look.motion))
-    if way < STILL and count >= LEAST_PICKS and np.isfinite(look.motion).mean() > 0.5:
+    still = way < STILL and count >= LEAST_PICKS and np.isfinite(look.motion).mean() > 0.5
+    if still or picks < LEAST_PICKS:
         raise ImportSourceError(
-            f"{film}: the camera does not move: in {seconds:.1f} s the picture shifts by {100 * way:.1f} % of its "
-            "width; a map needs views from different places; walk, or map a camera that stands still with poses of "
-            "kind 'fixed'"
-        )
-    if picks < LEAST_PICKS:
-        raise ImportSourceError(
-            f"{film}: is too short: {count} frames in {seconds:.1f} s give {picks} views a step apart, {LEAST_PICKS} "
-            "needed; film for ten seconds or more while walking"
+            f"{film}: is too short, or the camera does not move: {count} frames in {seconds:.1f} s, whose picture "
+            f"shifts by {100 * way:.1f} % of its width, give {picks} views a step apart, {LEAST_PICKS} needed; film "
+            "for ten seconds or more while walking, or map a camera that stands still with poses of kind 'fixed'"
         )
 
 
@@ -96,9 +92,8 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
 
 
 def focal_note(film: object, calibration: object, focal_px: float, check: FocalCheck) -> list[str]:
-    """What is wrong with the focal length of a calibration; empty where nothing is, or the film does not tell.
-    ImportSourceError where it is far off. ``focal_px`` is given, in pixels of the film.
-    """
+    """What is wrong with the focal length of a calibration, ``focal_px`` of the film; empty where nothing is, or the
+    film does not tell. ImportSourceError where it is far off."""
     off = abs(check.factor - 1)
     if off < UNCERTAIN_FOCAL or check.sigmas < LEAST_SIGMAS:
         return []
@@ -113,11 +108,8 @@ def focal_note(film: object, calibration: object, focal_px: float, check: FocalC
 
 
 def baseline_notes(ahead: bool, angle_deg: float, focal_sigma: float | None) -> list[str]:
-    """Notes on what a film tells badly, because its camera hardly moves sideways; none where it tells all.
-
-    Of whether the model begins with two frames straight ahead of each other, the median angle between the rays to a
-    point, and the standard deviation of the focal length that was found, as a fraction.
-    """
+    """What a film tells badly, because its camera hardly moves sideways: by whether its model begins with two frames
+    straight ahead of each other, the median angle between rays to a point, and the focal length's ``focal_sigma``."""
     notes: list[str] = []
     if ahead or angle_deg < SMALL_ANGLE_DEG:
         notes.append(
