@@ -56,12 +56,8 @@ def finish_session(
     but for its map. A summary that is there means that the map next to it is whole, and the one that it is of. Raises
     MapError: the map cannot be written. ConfigError: the report cannot be written.
 
-    Args:
-        session: To be finished; it counts what came since this process began.
-        out: The folder.
-        stopped_by: What ended it early; empty = nothing.
-        restarted: What became of the map of a process before this one; empty = there was none.
-        progress: Called after each step.
+    ``stopped_by`` says what ended it early, ``restarted`` what became of the map of a process before this one, which
+    the session does not count; empty = nothing. ``progress`` is called after each step.
     """
     try:
         session.process_rest()

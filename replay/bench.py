@@ -52,12 +52,9 @@ def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02) -> dic
     rows = rows.astype(np.int32)
     for frame in posed:
         depth = np.ascontiguousarray(frame.depth_m, np.float32)
-        open3d_ms.append(_milliseconds(lambda f=frame, d=depth: reference.integrate(f, d)))
+        open3d_ms.append(_milliseconds(reference.integrate, frame, depth))
         for count, voxel_map in maps.items():
-            p = votes[count]
-            ours_ms[count].append(
-                _milliseconds(lambda f=frame, d=depth, m=voxel_map, p=p: m.integrate(f, d, p, rows=rows))
-            )
+            ours_ms[count].append(_milliseconds(voxel_map.integrate, frame, depth, votes[count], rows=rows))
     theirs = float(np.median(open3d_ms[WARM_UP:]))
     ours = {count: float(np.median(values[WARM_UP:])) for count, values in ours_ms.items()}
     return {
@@ -166,9 +163,9 @@ class _Open3DFusion:
         self._grid.integrate(blocks, depth, color, K, K, T_camera_world, *limits)
 
 
-def _milliseconds(work: Callable[[], object]) -> float:
+def _milliseconds(work: Callable[..., object], *arguments: object, **options: object) -> float:
     began = time.perf_counter()
-    work()
+    work(*arguments, **options)
     return (time.perf_counter() - began) * 1e3
 
 

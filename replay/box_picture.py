@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper import plots
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.upright import camera_up, ceiling_height, plan_rotation
 from semantic_mapper.fields.scene.primitives import Primitive
@@ -17,19 +18,6 @@ from semantic_mapper.geometry import invert_pose, nearest_pixels, project, trans
 from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.plain_text import counted
-from semantic_mapper.plots import (
-    PANEL,
-    SMALL_PT,
-    Color,
-    LegendRow,
-    hex_color,
-    new_figure,
-    put_legend,
-    put_picture,
-    put_text,
-    put_title,
-    rendered,
-)
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.replay.overview import draw_points, fitted, from_above, put_scale_bar
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
@@ -58,13 +46,9 @@ class _Place(NamedTuple):
 
 
 def draw_boxes(log: Log, boxes: Sequence[Primitive], title: str) -> tuple[UInt8, int]:
-    """Draw boxes, which are in the world of a log, over the frames that show the most of them, and from above.
-
-    Raises LogError: the log has no frames.
-
-    Returns:
-        The picture (H, W, 3) uint8 RGB, and how many boxes have their middle in view of any frame.
-    """
+    """Draw boxes, which are in the world of a log, over the frames that show the most of them, and from above. Returns
+    the picture (H, W, 3) RGB, and how many boxes have their middle in view of any frame. Raises LogError: the log has
+    no frames."""
     places = [
         _Place(number, e.stamp_ns, log.info.cameras[e.source], np.array(e.T_world_camera, np.float64).reshape(4, 4))
         for number, (e, _) in enumerate(log.frame_parts())
@@ -90,40 +74,40 @@ def _in_view(boxes: Sequence[Primitive], at: _Place) -> NDArray[np.bool_]:
     return there & nearest_pixels(transform(invert_pose(at.T_world_camera), middle), at.intrinsics)[0]
 
 
-@rendered
+@plots.rendered
 def _draw(
     shown: Sequence[tuple[_Place, PosedFrame]],
     surface: Sequence[PosedFrame],
     poses: Float64,
     boxes: Sequence[Primitive],
-    colors: dict[str, Color],
+    colors: dict[str, plots.Color],
     title: str,
 ) -> Figure:
     heights = [round(TILE_WIDTH * at.intrinsics.height / at.intrinsics.width) for at, _ in shown]
     width = SHOWN * (TILE_WIDTH + GAP) - GAP
     top = HEADER + CAPTION + max(heights) + GAP + CAPTION
-    figure = new_figure(width + 2 * MARGIN, top + PLAN_HEIGHT + MARGIN)
-    put_title(figure, title, counted(len(boxes), "box", "boxes"))
+    figure = plots.new_figure(width + 2 * MARGIN, top + PLAN_HEIGHT + MARGIN)
+    plots.put_title(figure, title, counted(len(boxes), "box", "boxes"))
     for column, ((at, frame), height) in enumerate(zip(shown, heights, strict=True)):
         box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
-        axes = put_picture(figure, box, frame.rgb, f"frame {at.number}, {frame.stamp_ns} ns", smooth=True)
+        axes = plots.put_picture(figure, box, frame.rgb, f"frame {at.number}, {frame.stamp_ns} ns", smooth=True)
         for b in boxes:
             if (pose := b.pose_at(at.stamp_ns)) is not None:
                 _put_edges(axes, replace(b, T_world_box=pose), at, colors[b.class_name])
     plan_width = width - LEGEND_WIDTH - GAP
     _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, poses, boxes, colors)
     counts = {name: sum(box.class_name == name for box in boxes) for name in colors}
-    rows: list[LegendRow] = [(f"{name}, {counts[name]}", color, None) for name, color in colors.items()]
-    put_legend(figure, (MARGIN + plan_width + GAP, top, LEGEND_WIDTH, PLAN_HEIGHT), rows)
+    rows: list[plots.LegendRow] = [(f"{name}, {counts[name]}", color, None) for name, color in colors.items()]
+    plots.put_legend(figure, (MARGIN + plan_width + GAP, top, LEGEND_WIDTH, PLAN_HEIGHT), rows)
     return figure
 
 
-def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
+def _put_edges(axes: Axes, box: Primitive, at: _Place, color: plots.Color) -> None:
     """The edges of a box in the tile of a frame, and its id where its middle is in view."""
     k = at.intrinsics
     scale = TILE_WIDTH / k.width
     for ends in edges_in_view(box, at.T_world_camera, k):
-        axes.plot(*((ends + 0.5) * scale).T, color=hex_color(color), linewidth=1.4, linestyle="-")
+        axes.plot(*((ends + 0.5) * scale).T, color=plots.hex_color(color), linewidth=1.4, linestyle="-")
     middle = transform(invert_pose(at.T_world_camera), box.T_world_box[:3, 3][None])
     if nearest_pixels(middle, k)[0][0]:
         _put_id(axes, (project(middle, k)[0] + 0.5) * scale, box.id)
@@ -147,7 +131,7 @@ def _put_plan(
     surface: Sequence[PosedFrame],
     poses: Float64,
     boxes: Sequence[Primitive],
-    colors: dict[str, Color],
+    colors: dict[str, plots.Color],
 ) -> None:
     """Surface, path and boxes from above, in metres of a level frame."""
     xyz, rgb = _surface(surface)
@@ -163,8 +147,8 @@ def _put_plan(
     every = np.clip(every, path.min(axis=0) - SIDE_M, path.max(axis=0) + SIDE_M)
     size = where[2:]
     centre, scale = fitted(np.stack((every.min(axis=0), every.max(axis=0))), size)
-    picture, _ = draw_points(points, rgb[inside], size, PANEL, camera=(centre, scale))
-    axes = put_picture(figure, where, picture, "from above: surface, the camera's path, and boxes")
+    picture, _ = draw_points(points, rgb[inside], size, plots.PANEL, camera=(centre, scale))
+    axes = plots.put_picture(figure, where, picture, "from above: surface, the camera's path, and boxes")
 
     def pixels(at: Float64) -> Float64:
         return (at[:, :2] - centre) * scale + np.array(size) / 2
@@ -172,7 +156,7 @@ def _put_plan(
     axes.plot(*pixels(path).T, color="white", linewidth=1, linestyle=":")
     for (box, _), corners in zip(moments, prints, strict=True):
         outline = cv2.convexHull(pixels(corners).astype(np.float32)).reshape(-1, 2).astype(np.float64)
-        color = hex_color(colors[box.class_name])
+        color = plots.hex_color(colors[box.class_name])
         axes.fill(*outline.T, facecolor=f"{color}26", edgecolor=color, linestyle="-")
         if ((outline.mean(axis=0) > 0) & (outline.mean(axis=0) < size)).all():
             _put_id(axes, outline.mean(axis=0), box.id)
@@ -193,10 +177,12 @@ def _surface(frames: Sequence[PosedFrame]) -> tuple[Float64, UInt8]:
 
 def _put_id(axes: Axes, at: Float64, box_id: int) -> None:
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1}
-    put_text(axes, (float(at[0]), float(at[1])), str(box_id), ha="center", fontsize=SMALL_PT, bbox=behind, clip_on=True)
+    plots.put_text(
+        axes, (float(at[0]), float(at[1])), str(box_id), ha="center", fontsize=plots.SMALL_PT, bbox=behind, clip_on=True
+    )
 
 
-def _class_colors(names: Sequence[str], label_set: LabelSet | None) -> dict[str, Color]:
+def _class_colors(names: Sequence[str], label_set: LabelSet | None) -> dict[str, plots.Color]:
     """Colours of the classes, in the order in which they come: those of the label set where it has them."""
     known = {} if label_set is None else dict(zip(label_set.names, label_set.colors, strict=True))
     different = list(dict.fromkeys(names))

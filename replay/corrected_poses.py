@@ -29,11 +29,11 @@ _log = get_logger(__name__)
 
 
 class Trajectory(NamedTuple):
-    """Corrected poses in order of time, stamps (N,) and T_world_camera (N, 4, 4), and where they come from."""
+    """Corrected poses in order of time."""
 
-    path: Path
-    stamps_ns: NDArray[np.int64]
-    poses: Float64
+    path: Path  # where they come from
+    stamps_ns: NDArray[np.int64]  # (N,)
+    poses: Float64  # (N, 4, 4) T_world_camera
 
 
 def read_corrections(path: Path) -> Trajectory:
@@ -58,14 +58,8 @@ def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
 def match_frames(
     keys: Iterable[tuple[str, int]], stamps_ns: NDArray[np.int64], poses: Float64, within_ns: int
 ) -> dict[tuple[str, int], Float64]:
-    """Poses by the frames, (camera_id, stamp_ns), of one camera that were taken nearest to their stamps; those without
-    one are left out.
-
-    Args:
-        keys: Of the frames.
-        stamps_ns, poses: (N,) and (N, 4, 4) T_world_camera.
-        within_ns: Largest difference.
-    """
+    """Poses (N, 4, 4) by the frames, ``keys`` (camera_id, stamp_ns) of one camera, that were taken nearest to their
+    stamps (N,), ``within_ns`` at most; those without one are left out."""
     rising = sorted(keys, key=lambda key: key[1])
     stamps = np.array([stamp_ns for _, stamp_ns in rising], np.int64)
     frame_of = match_nearest(stamps_ns, stamps, within_ns) if rising else [-1] * len(stamps_ns)
@@ -82,11 +76,8 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
     keys = sorted(session.pipeline.corrector.poses(), key=lambda key: key[1])
     cameras = sorted({camera_id for camera_id, _ in keys})
     if len(cameras) > 1:
-        raise ImportSourceError(
-            f"{trajectory.path}: a trajectory is that of one camera, and this log has {', '.join(cameras)}"
-        )
-    poses = match_frames(keys, trajectory.stamps_ns, trajectory.poses, MATCH_NS)
-    given = len(trajectory.stamps_ns)
+        raise ImportSourceError(f"{trajectory.path}: is the way of one camera, and this log has {', '.join(cameras)}")
+    poses, given = match_frames(keys, *trajectory[1:], MATCH_NS), len(trajectory.stamps_ns)
     frozen = session.pipeline.corrector.status.frozen  # frames that have left the history, whose stamps are not known
     if not poses:
         first, frames = trajectory.stamps_ns[0] / 1e9, keys[0][1] / 1e9 if keys else math.nan

@@ -24,13 +24,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
-from semantic_mapper.replay.evaluate.methods import (
-    Evaluation,
-    baseline_predictors,
-    evaluate_frames,
-    field_predictors,
-    thing_tellers,
-)
+from semantic_mapper.replay.evaluate import methods
 from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.job_monitor import JobMonitor
@@ -66,13 +60,9 @@ def replay_log(
     LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why. ImportSourceError: the
     corrections cannot be read.
 
-    Args:
-        log: The log, a folder with the parts of a recording, or these parts.
-        weights: None = those that ship with the package.
-        max_frames: 0 = all.
-        rerun: Where to write a Rerun recording.
-        corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
-        monitor: Gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
+    ``log`` may be a folder with the parts of a recording, or these parts; ``max_frames`` 0 means all. A Rerun recording
+    goes to ``rerun``. ``corrections`` is a trajectory file that the map is moved to at the end of the log. ``monitor``
+    gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
     """
     monitor = monitor or JobMonitor()
     trajectory = read_corrections(corrections) if corrections else None
@@ -130,17 +120,12 @@ def evaluate_log(
     baseline_s: float = 0.0,
     instances: Path | None = None,
     monitor: JobMonitor | None = None,
-) -> Evaluation:
+) -> methods.Evaluation:
     """Score a log with several methods. Raises LogError, LabelError, WeightsError: nothing can be scored.
 
-    Computed depth never waits for later frames, since scores are of frames as they come.
-
-    Args:
-        log: The log, or a folder with the parts of a recording.
-        weights: None = those that ship with the package.
-        max_frames: 0 = all.
-        baseline_s: Also fit the baselines to the keyframes of the weights, the U-Net for so long; 0 = no baselines.
-        instances: Folder with images of the frames' true objects; None = things are not scored.
+    Computed depth never waits for later frames, since scores are of frames as they come. ``baseline_s``: also fit the
+    baselines to the keyframes of the weights, the U-Net for so long; ``instances``: folder with images of the frames'
+    true objects, without which things are not scored.
     """
     monitor, config = monitor or JobMonitor(), config or MapperConfig()
     from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
@@ -161,10 +146,10 @@ def evaluate_log(
         if instances is not None:
             require_metres(source.info.scale_known, "instances")
             panoptic = PanopticTruth(InstanceFolder(instances, source), stream_labels, checkpoint.label_set)
-        predictors = field_predictors(bundle)
+        predictors = methods.field_predictors(bundle)
         if baseline_s:
             monitor.start(100)
-            predictors |= baseline_predictors(
+            predictors |= methods.baseline_predictors(
                 _frames_at(source, checkpoint.train_stamps_ns),
                 checkpoint.label_set,
                 baseline_s,
@@ -173,7 +158,7 @@ def evaluate_log(
             )
         total = min(len(source), max_frames or len(source))
         monitor.start(total)
-        found = evaluate_frames(
+        found = methods.evaluate_frames(
             (frame for _, frame in zip(range(total), source, strict=False)),
             predictors,
             stream_labels,
@@ -182,7 +167,7 @@ def evaluate_log(
             on_frame=lambda done: monitor.set(done, "scoring"),
             voxel_map=bundle.pipeline.voxel_map,
             panoptic=panoptic,
-            things=thing_tellers(bundle),
+            things=methods.thing_tellers(bundle),
         )
         return replace(found, damaged=len(source.errors), weights=bundle.weights_path.name)
 
@@ -229,11 +214,9 @@ def refine_map(
     Raises ConfigError: ``up`` is no direction, or the new map cannot be written there. MapError, WeightsError: map and
     weights cannot be read, or do not go together.
 
-    Args:
-        weights: Of a network, or ``smoothed``; None = those that ship, or smoothing for a map of other classes.
-        fill: Surface without votes gets a class that is at least so likely; 1 = never.
-        up: Up in the world: ``auto``, an axis, or three numbers.
-        by_name: Whether weights of other classes are matched by the names of these.
+    ``weights`` may be ``smoothed``; None = those that ship, or smoothing for a map of other classes. Surface without
+    votes gets a class that is at least as likely as ``fill``, 1 = never. ``up`` is ``auto``, an axis, or three numbers;
+    ``by_name`` matches weights of other classes by the names of these.
     """
     monitor = monitor or JobMonitor()
     direction = parse_up(up)

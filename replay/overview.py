@@ -14,22 +14,10 @@ import numpy as np
 import scipy  # loads `spatial` when it is first used
 from numpy.typing import NDArray
 
+from semantic_mapper import plots
 from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.plots import (
-    DIM_TEXT,
-    PANEL,
-    class_colors,
-    class_rows,
-    new_figure,
-    place,
-    put_legend,
-    put_picture,
-    put_text,
-    put_title,
-    rendered,
-)
 from semantic_mapper.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
@@ -62,7 +50,7 @@ class ViewStrip:
     depth_rendered: bool = False  # the field rendered it; no sensor measured it
 
 
-@rendered
+@plots.rendered
 def draw_overview(
     strips: Sequence[ViewStrip],
     points: MapPoints,
@@ -74,20 +62,14 @@ def draw_overview(
     unit: str = "m",
     rooms: Sequence[tuple[str, Float64]] = (),
 ) -> Figure:
-    """Draw a row of tiles for each strip, under them the map and the legend, 1600 pixels wide.
+    """Draw a row of tiles for each strip, best one to three, under them the map and the legend, 1600 pixels wide.
 
-    Args:
-        strips: Frames to show, best one to three.
-        points: The map; N may be 0.
-        label_set: Names and colours of all labels.
-        title, subtitle: Head of the picture.
-        up: (3,) rough up of the world, as of ``upright.camera_up``; None estimates it from the points alone.
-        unit: Of lengths.
-        rooms: Name and outline (N, 3) in the world of each room, drawn into the map from above.
+    ``up`` (3,) is a rough up of the world, as of ``upright.camera_up``; None estimates it from the points alone.
+    ``unit`` is that of lengths. ``rooms``, each a name and an outline (N, 3) in the world, are drawn from above.
     """
     top = HEADER + sum(_strip_height(strip) + GAP for strip in strips)
-    figure = new_figure(WIDTH, top + CAPTION + MAP_HEIGHT + MARGIN)
-    put_title(figure, title, subtitle)
+    figure = plots.new_figure(WIDTH, top + CAPTION + MAP_HEIGHT + MARGIN)
+    plots.put_title(figure, title, subtitle)
     y = HEADER
     for strip in strips:
         _put_strip(figure, y, strip, label_set, unit)
@@ -95,23 +77,23 @@ def draw_overview(
     _put_map(figure, top + CAPTION, points, label_set, up, unit, rooms)
     shown = [image for strip in strips for image in (strip.rendered, strip.truth) if image is not None]
     x, y = WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION
-    legend = place(figure, (x, y, LEGEND_WIDTH, MAP_HEIGHT))
-    put_text(legend, (0, -11), "class, fraction of the map", color=DIM_TEXT)
+    legend = plots.place(figure, (x, y, LEGEND_WIDTH, MAP_HEIGHT))
+    plots.put_text(legend, (0, -11), "class, fraction of the map", color=plots.DIM_TEXT)
     hints = ["paler in the map = less sure"]
     if points.measured is not None and not points.measured.all():
         share = f"{100 * (1 - points.measured.mean()):.0f} %"
         hints.append(f"striped = computed: {share}" if points.measured.any() else "all of it computed, no sensor")
     for row, hint in enumerate(reversed(hints)):
-        put_text(legend, (0, MAP_HEIGHT - 10 - 20 * row), hint, color=DIM_TEXT)
+        plots.put_text(legend, (0, MAP_HEIGHT - 10 - 20 * row), hint, color=plots.DIM_TEXT)
     box = (x, y, LEGEND_WIDTH, MAP_HEIGHT - 10 - 20 * len(hints))
-    put_legend(figure, box, class_rows(points.label, label_set, shown))
+    plots.put_legend(figure, box, plots.class_rows(points.label, label_set, shown))
     return figure
 
 
-@rendered
+@plots.rendered
 def draw_strip(strip: ViewStrip, label_set: LabelSet, unit: str = "m") -> Figure:
     """One frame as a row of tiles with captions, 1600 pixels wide."""
-    figure = new_figure(WIDTH, _strip_height(strip))
+    figure = plots.new_figure(WIDTH, _strip_height(strip))
     _put_strip(figure, 0, strip, label_set, unit)
     return figure
 
@@ -127,27 +109,30 @@ def _strip_height(strip: ViewStrip) -> int:
 
 
 def _put_strip(figure: Figure, y: int, strip: ViewStrip, label_set: LabelSet, unit: str) -> None:
-    tiles = [(f"{strip.name}: camera", strip.rgb), ("rendered semantics", class_colors(strip.rendered, label_set))]
+    tiles = [
+        (f"{strip.name}: camera", strip.rgb),
+        ("rendered semantics", plots.class_colors(strip.rendered, label_set)),
+    ]
     if strip.truth is not None:
-        tiles.append(("truth", class_colors(strip.truth, label_set)))
+        tiles.append(("truth", plots.class_colors(strip.truth, label_set)))
     if strip.depth_m is not None:
         caption, picture = _color_depth(strip.depth_m, unit)
         tiles.append((f"rendered {caption}" if strip.depth_rendered else caption, picture))
     width, height = _tile_size(strip)
     for column, (caption, picture) in enumerate(tiles):
         box = (MARGIN + column * (width + GAP), y + CAPTION, width, height)
-        put_picture(figure, box, picture, caption, smooth=column == 0)
+        plots.put_picture(figure, box, picture, caption, smooth=column == 0)
 
 
 def _color_depth(depth_m: Float32, unit: str) -> tuple[str, UInt8]:
     known = np.isfinite(depth_m) & (depth_m > 0)
     if not known.any():
-        return "depth: none", np.full((*depth_m.shape, 3), PANEL, np.uint8)
+        return "depth: none", np.full((*depth_m.shape, 3), plots.PANEL, np.uint8)
     near, far = np.percentile(depth_m[known], (1, 99))
     level = np.clip((depth_m - near) / max(far - near, 1e-3), 0, 1)
     gray = np.where(known, 255 * (1 - level), 0).astype(np.uint8)
     picture = cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB).astype(np.uint8)
-    picture[~known] = PANEL
+    picture[~known] = plots.PANEL
     return f"depth: {near:.1f} {unit} (red) to {far:.1f} {unit} (blue)", picture
 
 
@@ -173,22 +158,22 @@ def _put_map(
     R_plan_world = plan_rotation(xyz, up)
     plan = from_above(xyz[inside].astype(np.float64) @ R_plan_world.T)
     camera = fitted(plan, size) if len(plan) else (np.zeros(2), 1.0)
-    above, scale = draw_points(plan, colors, size, PANEL, camera=camera)
+    above, scale = draw_points(plan, colors, size, plots.PANEL, camera=camera)
     azimuth = open_side(upright)
     seen = ~hides_the_room(upright, azimuth)
-    angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
+    angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, plots.PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
-    axes = put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
+    axes = plots.put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
     put_scale_bar(axes, scale, unit)
     for name, outline in rooms:
         corners = (from_above(outline @ R_plan_world.T)[:, :2] - camera[0]) * scale + np.array(size) / 2
         _put_room(axes, name, corners)
-    put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
+    plots.put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
 def _point_colors(points: MapPoints, label_set: LabelSet) -> UInt8:
     """Class colours; the camera's brightness shows through a little, and what is not sure is paler."""
-    colors = class_colors(points.label, label_set).astype(np.float32)
+    colors = plots.class_colors(points.label, label_set).astype(np.float32)
     if not len(colors):
         return colors.astype(np.uint8)
     luma = points.rgb.astype(np.float32).mean(axis=1)
@@ -222,7 +207,7 @@ def _put_room(axes: Axes, name: str, corners: Float64) -> None:
     axes.plot(x, y, color="white", linewidth=1.2, clip_on=True)
     at = corners[int((corners @ (0.3, 1.0)).argmin())] + (6, 12)
     behind = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 1.5}
-    put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
+    plots.put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
 
 
 def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
@@ -232,7 +217,7 @@ def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     y = axes.get_ylim()[0] - 18
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
-    put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)
+    plots.put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)
 
 
 def draw_points(
@@ -243,22 +228,15 @@ def draw_points(
     *,
     camera: tuple[Float64, float] | None = None,
 ) -> tuple[UInt8, float]:
-    """Draw points in parallel projection, fitted into the picture unless a camera is given.
+    """Draw points (N, 3), metres to the right, down and away from the viewer, in parallel projection. Returns the
+    picture (H, W, 3) of a ``size`` (width, height), and its scale in pixels a metre.
 
-    Args:
-        xyz_view: (N, 3) metres: x to the right, y down, z away from the viewer.
-        colors: (N, 3) uint8.
-        size: (width, height) of the picture.
-        background: (r, g, b).
-        camera: The x and y (2,) of the picture's centre and pixels a metre, to draw several maps alike.
-
-    Returns:
-        (H, W, 3) uint8 picture and its scale in pixels a metre.
+    It is fitted to the points unless a camera is given: x and y (2,) of the picture's centre, and pixels a metre.
     """
     width, height = size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING
     canvas = np.full((height, width, 3), background, np.uint8)
     if not len(xyz_view):
-        return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), 1.0
+        return cv2.resize(canvas, size).astype(np.uint8), 1.0
     centre, scale = fitted(xyz_view, size) if camera is None else camera
     scale *= SUPERSAMPLING
     side = int(np.clip(np.ceil(point_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))

@@ -40,22 +40,19 @@ def relocalize_frames(
             of_world.append(sighting(found.T_map_camera, frame.T_world_camera))
         rows.append(row)
         on_frame(len(rows) + len(unreadable))
+    sessions: list[dict[str, Any]] = []
+    for world, sightings in seen.items():
+        consensus = find_consensus(sightings)
+        T_map_world = None if consensus.refusal else agreed(consensus.agreeing).tolist()
+        sessions.append(
+            {"world": world, "found": len(sightings), "agreeing": len(consensus.agreeing)}
+            | {"disagreement": consensus.refusal, "T_map_world": T_map_world}
+        )
     return {
         "frames": len(rows),
         "found": sum(map(len, seen.values())),
         "refused": dict(Counter(row["reason"] for row in rows if "reason" in row).most_common()),
         "unreadable": unreadable,
-        "sessions": [_describe_world(world, sightings) for world, sightings in seen.items()],
+        "sessions": sessions,
         "looks": rows,
-    }
-
-
-def _describe_world(world: int, seen: list[Sighting]) -> dict[str, Any]:
-    consensus = find_consensus(seen)
-    return {
-        "world": world,
-        "found": len(seen),
-        "agreeing": len(consensus.agreeing),
-        "disagreement": consensus.refusal,
-        "T_map_world": None if consensus.refusal else agreed(consensus.agreeing).tolist(),
     }

@@ -84,10 +84,8 @@ def hold_folder(out: Path) -> Iterator[None]:
 
 
 def map_path(path: Path) -> Path:
-    """The file of a map that is named itself, or by the folder it is in.
-
-    Raises ConfigError: no map is there, or it is a log; with what to do, from what is there.
-    """
+    """The file of a map that is named itself, or by its folder. Raises ConfigError: no map is there, or it is a log;
+    with what to do, from what is there."""
     if not path.exists():
         raise ConfigError(f"{path}: no such map file or folder")
     if path.is_dir() and (path / MAP_NAME).is_file():

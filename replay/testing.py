@@ -98,11 +98,9 @@ class ReplayedMap:
     def assert_like(self, stored: Path | str, **tolerances: float) -> None:
         """Fail where this run is not as an earlier one, saying what differs; ``pytest --update-runs`` stores it there.
 
-        Raises ConfigError: no such tolerance, or a folder without a run. MapError: a damaged map.
-
-        Args:
-            stored: A folder with ``map.npz`` and ``summary.json``, or a map alone; relative to pytest's root folder.
-            tolerances: As of ``semantic_mapper.replay.compare.Tolerances``: score, surface_m, labels.
+        ``stored`` is a folder with ``map.npz`` and ``summary.json``, or a map alone, relative to pytest's root folder;
+        ``tolerances`` are score, surface_m and labels. Raises ConfigError: no such tolerance, or a folder without a
+        run. MapError: a damaged map.
         """
         target = self.root / stored
         if self.update:
@@ -125,10 +123,7 @@ class ReplayedMap:
 class LogReplays:
     """Replays logs, each once for the same settings, however many tests ask for it.
 
-    Args:
-        root: What relative paths begin at.
-        make_folder: Gives a new folder for the results of a replay, by the log's name.
-        update: See ``ReplayedMap``.
+    Relative paths begin at ``root``; ``make_folder`` gives a new folder for the results of a replay, by the log's name.
     """
 
     def __init__(self, root: Path, make_folder: Callable[[str], Path], *, update: bool = False) -> None:
@@ -146,17 +141,11 @@ class LogReplays:
         quality: Quality = None,
         max_frames: int = 0,
     ) -> ReplayedMap:
-        """Replay a log through ``MappingPipeline.step``, as ``semantic-mapper replay`` does.
+        """Replay a log (.mcap) through ``MappingPipeline.step``, as ``semantic-mapper replay`` does: by weights, None =
+        those that ship, and a config of the mapper, a TOML file or its sections as a dict; ``max_frames`` 0 means all.
 
         Raises LogError: the log cannot be read, or none of its frames can be mapped. WeightsError, ConfigError,
         MapError: as of ``Mapper.load`` and ``MappingPipeline.step``.
-
-        Args:
-            log: Recorded log (.mcap).
-            weights: None = those that ship with the package.
-            config: Of the mapper: a TOML file, or its sections as a dict.
-            quality: None = as the config says.
-            max_frames: 0 = all.
         """
         log = self._root / log
         weights = None if weights is None else self._root / weights

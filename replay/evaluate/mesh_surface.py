@@ -21,19 +21,13 @@ ROUGHLY_M = 0.10  # and as roughly mapped
 
 
 def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
-    """Figures of the map in a replay's folder against a mesh in the same world frame.
+    """Figures of the map in a replay's folder against a mesh in the same world frame: an .npz with ``vertices`` (V, 3)
+    metres, ``faces`` (F, 3) and, if there are any, ``label`` (V,) uint8 ids of the replay's label set (others are not
+    counted). Raises MapError: a file is missing or does not hold what it should.
 
-    Raises MapError: a file is missing or does not hold what it should.
-
-    Args:
-        folder: Holds ``map.npz``.
-        mesh: .npz with ``vertices`` (V, 3) metres, ``faces`` (F, 3) and, if there are any, ``label`` (V,) uint8 ids of
-            the replay's label set (0 and other ids are not counted).
-
-    Returns:
-        ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: map points within 5 cm, of all
-        (a map may hold more than the mesh); ``complete``, ``complete_10cm``: fraction of vertices with a map point
-        within 5 cm and within 10 cm; ``mesh_miou``: labels at the vertices, null without labels.
+    Gives ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: map points within 5 cm, of all (a
+    map may hold more than the mesh); ``complete``, ``complete_10cm``: fraction of vertices with a map point within 5 cm
+    and within 10 cm; ``mesh_miou``: labels at the vertices, null without labels.
     """
     try:
         with np.load(mesh) as data:

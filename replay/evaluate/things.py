@@ -67,13 +67,8 @@ class InstanceFolder:
 
 
 class ThingSurface:
-    """The N surface voxels of a map as it is now; MapError where its lengths are not metres.
-
-    Attributes:
-        xyz: (N, 3) float64 surface points, world metres.
-        number: (N,) which of ``things`` each belongs to; -1 = none.
-        things: As queries find them.
-    """
+    """The N surface voxels of a map as it is now, ``xyz`` (N, 3) in world metres, its ``things`` as queries find them,
+    and the ``number`` (N,) of the thing of each voxel, -1 = none. MapError where lengths are not metres."""
 
     def __init__(self, voxel_map: VoxelMap, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         snapshot = MapMirror.of(voxel_map).snapshot()

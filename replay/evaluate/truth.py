@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.imaging import resize_depth, resize_label, working_intrinsics
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
@@ -75,21 +74,12 @@ class SurfaceTruth:
         votes = np.zeros((len(xyz), len(self._label_set)), np.uint16)
         points = xyz.astype(np.float64)
         for view in self._frames:
-            row, column, visible = _look_up(points, view.T_world_camera, view.intrinsics, view.depth_m)
+            p = transform(invert_pose(view.T_world_camera), points)
+            inside, row, column = nearest_pixels(p, view.intrinsics)
+            measured = view.depth_m[row, column]
+            visible = inside & (measured > 0) & (np.abs(measured - p[:, 2]) < AGREEMENT_M)
             channel = self._label_set.to_channels(view.label)[row, column]
             index = np.flatnonzero(visible & (channel != IGNORE_CHANNEL))
             votes[index, channel[index]] += 1
         channel = np.where(votes.any(axis=1), votes.argmax(axis=1), IGNORE_CHANNEL)
         return self._label_set.to_ids(channel)
-
-
-def _look_up(
-    points: Float64, T_world_camera: Float64, k: CameraIntrinsics, depth: Float32
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    p = transform(invert_pose(T_world_camera), points)
-    z = np.maximum(p[:, 2], 1e-3)
-    u, v = np.rint(k.fx * p[:, 0] / z + k.cx), np.rint(k.fy * p[:, 1] / z + k.cy)
-    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
-    row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
-    measured = depth[row, column]
-    return row, column, inside & (measured > 0) & (np.abs(measured - p[:, 2]) < AGREEMENT_M)

@@ -14,12 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion.sweep import (
-    inverse_depths,
-    relative_projections,
-    stack_images,
-    sweep_and_match,
-)
+from semantic_mapper.depth_from_motion.sweep import inverse_depths, relative_projections, stack_images, sweep_and_match
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView
 from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.types import Float32, Int64, UInt8
