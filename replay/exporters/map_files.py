@@ -88,13 +88,13 @@ def format_of(path: Path, given: str | None) -> Format:
 def parse_transform(text: str) -> Float64:
     """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
 
-    Raises ConfigError: neither of these. ShapeError, PoseError: the file holds something else than a rigid transform.
+    Raises ConfigError: neither of these. PoseError: the file holds something else than a rigid transform.
     """
     numbers = _numbers(text)
     if numbers is not None and numbers.shape == (4,):
         return yaw_transform(numbers[:3], float(numbers[3]))
     try:
-        T = np.loadtxt(Path(text), dtype=np.float64, ndmin=2)
+        T = np.loadtxt(Path(text), dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"--transform {text}: expected four numbers, x y z in metres and yaw in degrees, or a file with 4 rows of "
