@@ -41,19 +41,15 @@ def corner() -> VoxelMap:
     return voxel_map
 
 
-def test_the_name_of_a_file_tells_its_format_or_it_is_given() -> None:
+def test_formats_and_directions_are_read_from_words() -> None:
     assert format_of(Path("a.GLB"), None) == "glb" and format_of(Path("a.yaml"), None) == "grid"
     assert format_of(Path("a.ply"), None) == "ply" and format_of(Path("a.ply"), "ply-mesh") == "ply-mesh"
     for path, given in ((Path("a.stl"), None), (Path("map"), None), (Path("a.ply"), "stl")):
         with pytest.raises(ConfigError, match="which format"):
             format_of(path, given)
-
-
-def test_up_is_an_axis_or_three_numbers() -> None:
-    assert parse_up("auto") is None
+    assert parse_up("auto") is None and len(AXES) == 6
     np.testing.assert_array_equal(parse_up("-y"), (0, -1, 0))
     np.testing.assert_allclose(parse_up("0, 3 -4"), (0, 0.6, -0.8))
-    assert len(AXES) == 6
     for text in ("up", "1 2", "0 0 0", "nan 0 1"):
         with pytest.raises(ConfigError, match="--up"):
             parse_up(text)

@@ -58,7 +58,7 @@ def fuse(frame: PosedFrame) -> list[bytes]:
 
 
 def play_to(
-    log: Path, endpoint: str, answer: Callable[[PosedFrame], list[bytes] | None], **options: object
+    log: Path, endpoint: str, answer: Callable[[PosedFrame], list[bytes] | None], **how
 ) -> tuple[PlayReport, Mapper]:
     with (
         LogReader(log) as reader,
@@ -66,7 +66,7 @@ def play_to(
         Mapper(endpoint, answer) as mapper,
         LosslessSubscriber(endpoint + "-map", ACK_TOPICS) as acks,
     ):
-        report = play(reader, publisher, acks, PlayOptions(**options))  # type: ignore[arg-type]
+        report = play(reader, publisher, acks, **how)
     return report, mapper
 
 
@@ -91,7 +91,7 @@ def test_lockstep_drops_nothing_however_slow_the_mapper_is_and_a_refusal_is_an_a
 
 def test_a_mapper_that_does_not_answer_ends_the_playing_with_a_clear_error(small_log: Path, endpoint: str) -> None:
     with pytest.raises(NodeError, match=r"has not answered frame seq=2 of camera .front. within 0\.3 s"):
-        play_to(small_log, endpoint, lambda f: fuse(f) if f.seq < 2 else None, ack_timeout_s=0.3)
+        play_to(small_log, endpoint, lambda f: fuse(f) if f.seq < 2 else None, options=PlayOptions(ack_timeout_s=0.3))
 
 
 DYING_MAPPER = """
@@ -160,13 +160,8 @@ def test_playing_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoin
 
 def test_playing_can_be_stopped(small_log: Path, endpoint: str) -> None:
     stop = threading.Event()
-    with (
-        LogReader(small_log) as reader,
-        Publisher(endpoint, policy="block") as publisher,
-        Mapper(endpoint, fuse) as mapper,
-        LosslessSubscriber(endpoint + "-map", ACK_TOPICS) as acks,
-    ):
-        report = play(reader, publisher, acks, stop=stop, on_frame=lambda e: stop.set() if e.seq == 4 else None)
+    how = {"stop": stop, "on_frame": lambda envelope: stop.set() if envelope.seq == 4 else None}
+    report, mapper = play_to(small_log, endpoint, fuse, **how)
     assert report.stopped and report.published == 5
     assert mapper.received[-1] == EndOfStream("player", "stopped", 5)
 
