@@ -1,7 +1,6 @@
-"""Pictures with captions and legends in one style, drawn by Matplotlib, which is imported when something is drawn.
+"""Pictures with captions and legends in one style, drawn by Matplotlib's Agg, which is imported when something is.
 
-Figures are drawn by Agg, without a display, and never through ``pyplot``. Positions and sizes are pixels from the upper
-left corner, text is plain text: no mathematics, control characters as escapes.
+Positions and sizes are pixels from the upper left corner; text is plain text, with control characters as escapes.
 """
 
 from __future__ import annotations
@@ -138,10 +137,8 @@ def encode_picture(picture: UInt8, *, jpeg: bool = False) -> bytes:
 
 
 def write_picture(path: Path, picture: UInt8) -> None:
-    """Write an RGB picture (H, W, 3), as JPEG if its name says so, else as PNG; whole or not at all.
-
-    The folder is made if missing. Raises SemanticMapperError: it cannot be encoded or written.
-    """
+    """Write an RGB picture (H, W, 3), as JPEG if its name says so, else as PNG; whole or not at all. The folder is made
+    if missing. Raises SemanticMapperError: it cannot be encoded or written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, encode_picture(picture, jpeg=path.suffix.lower() in (".jpg", ".jpeg")))
@@ -210,10 +207,8 @@ def class_colors(label: UInt8, label_set: LabelSet) -> UInt8:
 
 
 def class_rows(labels: UInt8, label_set: LabelSet, shown: Sequence[UInt8] = ()) -> list[LegendRow]:
-    """Classes that occur, the most frequent first and the unknown last.
-
-    Fractions are of ``labels``, (N,) class ids of the map's points; classes of the ``shown`` images are listed, too.
-    """
+    """Classes that occur in ``labels``, (N,) ids of the map's points that fractions are of, or in ``shown`` images: the
+    most frequent first and the unknown last."""
     counts = np.bincount(labels.ravel(), minlength=256)
     present = counts + sum(np.bincount(image.ravel(), minlength=256) for image in shown) > 0
     fractions = counts / max(counts.sum(), 1)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch.nn import functional
 
-from semantic_mapper.fields.scene.grid import RaySamples, SceneGrid, heaviest
-from semantic_mapper.fields.scene.march import KEPT, gather
+from semantic_mapper.fields.scene.grid import RaySamples, heaviest
+from semantic_mapper.fields.scene.march import BIAS, KEPT, gather
 from semantic_mapper.fields.scene.panoptic import LEAST, Panoptic
 from semantic_mapper.fields.volume import interval_lengths
 from semantic_mapper.types import RayBatch
@@ -32,7 +33,7 @@ class UniformPanoptic(Panoptic):
         inside = ((points >= 0) & (points <= top)).all(-1)
         raw = gather(self.grid.values, points)[..., 0]
         length = interval_lengths(z, (rays.direction / self.grid.config.voxel_m).norm(dim=1))
-        depth = SceneGrid.optical_depth(raw) * length * inside * self.fitted
+        depth = functional.softplus(raw + BIAS) * length * inside * self.fitted
         before = torch.cumsum(depth, 1) - depth
         weight = torch.exp(-before) * -torch.expm1(-depth)
         return RaySamples(rays, points, z, weight, 1 - weight.sum(1))

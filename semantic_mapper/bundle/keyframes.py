@@ -56,13 +56,11 @@ class BundleProblem:
     priors: Float64  # (K, 4, 4) T_world_camera as given
     prior_sigmas: Float64  # (K, 2) one sigma of these in metres and radians; infinite = none was given
     points: Float64  # (P, 3) first guesses, world
-    # keyframe, point: (N,) rows of what sees and what is seen.
-    keyframe: Int64
-    point: Int64
+    keyframe: Int64  # (N,) rows of what sees
+    point: Int64  # (N,) rows of what is seen
     pixels: Float64  # (N, 2) as (u, v)
-    # keyframes, ids: Of a map: its keyframes, and the tracks of the points.
-    keyframes: Sequence[Keyframe] = ()
-    ids: Sequence[int] = ()
+    keyframes: Sequence[Keyframe] = ()  # of a map
+    ids: Sequence[int] = ()  # of a map: the tracks of the points
 
 
 class BundleResult(NamedTuple):
@@ -175,9 +173,7 @@ class KeyframeMap:
 
     def apply(self, problem: BundleProblem, found: BundleResult) -> None:
         """Take over what a bundle found. Keyframes added since move with the last one that took part.
-
-        Sights that are far off are dropped, and points with fewer than two left.
-        """
+        Sights that are far off are dropped, and points with fewer than two left."""
         keyframes, ids = problem.keyframes, problem.ids
         moved = found.poses[-1] @ invert_pose(keyframes[-1].T_world_camera)
         for keyframe, pose in zip(keyframes, found.poses, strict=True):
@@ -233,9 +229,7 @@ def triangulate(
 
 def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     """Least squares of all sights and priors (Levenberg-Marquardt, Huber). Deterministic.
-
-    At least one keyframe must be held or have a prior.
-    """
+    At least one keyframe must be held or have a prior."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     k = problem.intrinsics
     lens = gtsam.Cal3_S2(k.fx, k.fy, 0.0, k.cx, k.cy)

@@ -22,18 +22,13 @@ SENTENCES = {
 
 
 class PictureChecker:
-    """Judges the pictures of one camera in their order.
-
-    Attributes:
-        counters: Pictures by what was wrong: "dark", "blurred", "exposure_jump".
-        warnings: A sentence for each thing that is wrong with the last picture.
-    """
+    """Judges the pictures of one camera in their order."""
 
     def __init__(self) -> None:
         self._sharpness: deque[float] = deque(maxlen=_RECENT)
         self._brightness: float | None = None
-        self.counters: Counter[str] = Counter()
-        self.warnings: tuple[str, ...] = ()
+        self.counters: Counter[str] = Counter()  # pictures by what was wrong, a name of ``SENTENCES``
+        self.warnings: tuple[str, ...] = ()  # a sentence for each thing that is wrong with the last picture
 
     def look(self, rgb: UInt8) -> tuple[str, ...]:
         """Judge the next picture (H, W, 3); the names of what is wrong."""

@@ -104,10 +104,8 @@ class PoseRefiner:
         return RefinedPose(self._refined, refined, given_px, error_px)
 
     def corrections(self) -> dict[tuple[str, int], Float64]:
-        """Better poses T_world_camera (4, 4) of earlier frames, by camera and stamp, since the last call.
-
-        A frame is reported again while its keyframe is in the window, where its pose changed by 1 mm or 0.03 degrees.
-        """
+        """Better poses T_world_camera (4, 4) of earlier frames, by camera and stamp, since the last call: where their
+        keyframe is in the window, and they changed by 1 mm or 0.03 degrees."""
         self._collect(wait=False)
         changed: dict[tuple[str, int], Float64] = {}
         for frame in self._frames:
@@ -122,10 +120,8 @@ class PoseRefiner:
 
     def to_given(self, T_world_camera: Float64) -> tuple[Float64, float]:
         """Where the given poses have a camera (4, 4) of the world of refined poses, as the keyframes in reach say in
-        the mean; and what depth that is computed from refined poses has to be multiplied by.
-
-        Refined poses fit each other but drift in place and scale; given ones do not drift, whatever the error of each.
-        """
+        the mean; and what depth that is computed from refined poses has to be multiplied by. Refined poses fit each
+        other but drift in place and scale; given ones do not drift."""
         refined, given = self._keyframe_poses()
         if not len(given):
             return T_world_camera, 1.0

@@ -20,11 +20,8 @@ _MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than
 
 
 class ScaleEstimator:
-    """Compares ways between the same moments in the map and in a reference (robot odometry, a board).
-
-    Only lengths of ways are used: how the reference's world is turned does not matter, and its drift hardly. Errors of
-    a single way average out over ``_WINDOW_M``.
-    """
+    """Compares lengths of ways between the same moments in the map and in a reference (robot odometry, a board): how
+    the reference's world is turned does not matter, and its drift hardly."""
 
     def __init__(self) -> None:
         self._ways: deque[tuple[float, float]] = deque()  # the same way in metres and in units of the map

@@ -1,11 +1,9 @@
 """The per-image U-Net as a field: S-Ray's image encoder with a classifier, and nothing that looks across views.
 
-What multi-view fields have to beat. A query ray is answered from the query's own image and from no other: ``encode``
-classifies each source view, and ``render_samples`` reads the logits of the one source view whose camera is the query
-camera. A query whose own image is not among the sources, as in novel view synthesis, is *unknown* all over: an image
-classifier has no answer for a view that nobody took. So an evaluation has to put the query's own image among the
-sources, or to ask ``predict_image`` (the same logits without rays). In training the dense loss on the source views
-(``source_logits``) teaches the network in every step, the rays only in steps whose sources hold the query view.
+What multi-view fields have to beat. A query ray is answered from the source view whose camera is the query camera, and
+from no other; a query whose own image is not among the sources is *unknown* all over. So an evaluation has to put it
+there, or to ask ``predict_image`` (the same logits without rays). In training the dense loss on the source views
+(``source_logits``) teaches the network in every step.
 """
 
 from __future__ import annotations

@@ -19,10 +19,8 @@ COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
 def sample_inverse_depth(
     near_m: torch.Tensor, far_m: torch.Tensor, count: int, generator: torch.Generator | None = None
 ) -> torch.Tensor:
-    """Samples uniform in 1 / z between near and far, (R,) -> (R, count).
-
-    Interval midpoints without a generator; with one, a random place in each interval (stratified).
-    """
+    """Samples uniform in 1 / z between near and far, (R,) -> (R, count): interval midpoints without a generator; with
+    one, a random place in each interval (stratified)."""
     steps = torch.arange(count, dtype=near_m.dtype, device=near_m.device)
     if generator is None:
         fraction = (steps + 0.5)[None, :].expand(len(near_m), count) / count
@@ -34,11 +32,8 @@ def sample_inverse_depth(
 
 
 def sample_guided(rays: RayBatch, config: SamplingConfig) -> torch.Tensor:
-    """Samples round the depth prior of each ray; uniform in inverse depth for rays without one.
-
-    ``config.free_space`` of the ``config.guided`` samples lie between near and the guided interval: they find what
-    stands before a prior that is out of date.
-    """
+    """Samples round the depth prior of each ray; uniform in inverse depth for rays without one. ``free_space`` of them
+    lie between near and the guided interval: they find what stands before a prior that is out of date."""
     prior = rays.prior_depth_m
     has_prior = prior > 0
     z_prior = torch.where(has_prior, prior, torch.ones_like(prior))
@@ -67,10 +62,8 @@ def around_computed(config: SamplingConfig) -> SamplingConfig:
 def sample_from_weights(
     z: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None = None
 ) -> torch.Tensor:
-    """Draw ``count`` depths from the piecewise-constant distribution that ``weights`` (R, N) put on intervals round z.
-
-    Inverse-CDF sampling in inverse depth, evenly spaced quantiles without a generator. Not differentiable.
-    """
+    """Draw ``count`` depths from the piecewise-constant distribution that ``weights`` (R, N) put on intervals round z:
+    inverse-CDF sampling in inverse depth, evenly spaced quantiles without a generator. Not differentiable."""
     inv = 1 / z
     mid = (inv[:, 1:] + inv[:, :-1]) / 2
     edges = torch.cat((inv[:, :1], mid, inv[:, -1:]), dim=1)  # (R, N + 1)

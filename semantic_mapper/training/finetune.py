@@ -38,7 +38,6 @@ from semantic_mapper.training.fit import (
     Fitted,
     HeldOut,
     OnProgress,
-    State,
     cosine_rate,
     descend,
     fit,
@@ -118,8 +117,7 @@ def finetune(
         start: Weights to start from, adapted to ``label_set`` by class name; None = random. Kinds that hold one scene
             take its config and its box alone, "panoptic" also its boxes.
         config: At least one of ``seconds`` and ``steps`` set.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns anything true, the best weights so far are the result.
+        stopped: Asked before every step; once it returns anything true, the best weights so far are the result.
         seen_stamps_ns: Frames that ``start`` was fitted to; the result remembers them with its own.
         kind: Of the field; None = that of ``start``, or S-Ray.
 
@@ -188,21 +186,15 @@ def _run(
     model: LearnedField, scene: _Scene, config: FinetuneConfig, budget: Budget, generator: torch.Generator
 ) -> tuple[HeldOut, int, dict[str, float]]:
     """The best weights, the number of steps, and how much the own view counts."""
-    optimiser = make_optimiser(model, config.learning_rate, WEIGHT_DECAY)
-    encoder = model.image_encoder
+    optimiser, encoder = make_optimiser(model, config.learning_rate, WEIGHT_DECAY), model.image_encoder
     alive = encoder is not None and encoder.uncalibrated  # norms of a fresh encoder learn with the weights
-    if alive:
-        _settle_norms(model, scene.train)
-    elif encoder is not None:
+    if encoder is not None and not alive:
         encoder.freeze(*encoder.backbones())  # a few keyframes are no match for a million photographs
 
     def look() -> tuple[float, float]:
-        if alive:
-            _settle_norms(model, scene.train)
+        if encoder is not None and alive:  # take the statistics of all views: running means lag behind the weights
+            calibrate(encoder, to_device(stack_sources(scene.train), next(model.parameters()).device))
         return _evaluate(model, scene, config)
-
-    def state() -> State:
-        return copy.deepcopy(model.state_dict())
 
     # No steps on images where a kind says nothing of them, or the encoder is to stay what it is.
     images_from, images_until = config.frozen_encoder_fraction, 0.0
@@ -216,7 +208,7 @@ def _run(
     if images_from < images_until and has_depth and model.weigh_own_view(*factors):
         own_view = dict(zip(("factor", "factor_without_depth"), factors, strict=True))
     # Random weights get worse before they get better.
-    held_out = HeldOut(look, state, 0 if alive else config.patience, images_until)
+    held_out = HeldOut(look, lambda: copy.deepcopy(model.state_dict()), 0 if alive else config.patience, images_until)
     with budget.looking():
         held_out.judge(0)
     encoded = None if alive else _linear_probe(model, scene, config, held_out)
@@ -238,16 +230,8 @@ def _run(
 
     steps = fit(learn, budget, held_out)
     if steps < FEW_STEPS and not budget.stopped():
-        _log.warning(
-            "few_steps", steps=steps, reason="the budget was used up before anything could be learned; raise it"
-        )
+        _log.warning("few_steps", steps=steps, reason="the budget was used up before anything was learned; raise it")
     return held_out, steps, own_view
-
-
-def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
-    """Norms that are alive take the statistics of all views: running means lag behind weights that change fast."""
-    if model.image_encoder is not None:
-        calibrate(model.image_encoder, to_device(stack_sources(views), next(model.parameters()).device))
 
 
 def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, held_out: HeldOut) -> EncodedViews | None:
@@ -267,10 +251,7 @@ def _linear_probe(model: LearnedField, scene: _Scene, config: FinetuneConfig, he
 
 def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> bool:
     """Fit the class rows of ``model`` to the labelled pixels of ``views``, which it has ``encoded``; False = it cannot.
-
-    Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded: what is left for the steps
-    on rays is what they alone can do.
-    """
+    Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded."""
     rows = [model.get_parameter(name) for name in model.class_rows]
     channel = torch.stack([view.channel for view in views]).to(encoded.feature.device)
     optimiser = torch.optim.Adam(rows, PROBE_RATE)
@@ -404,10 +385,8 @@ def _withheld(channel: torch.Tensor, query: int, sources: Sequence[int], generat
 
 
 def step_on_images(model: LearnedField, views: Sequence[LabelledView], generator: torch.Generator) -> torch.Tensor:
-    """Loss of what a field that classifies images makes of some of the views, each by itself.
-
-    An image costs a fraction of what rays from several views cost; gradients flow into the encoder and the classifier.
-    """
+    """Loss of what a field that classifies images makes of some of the views, each by itself: an image costs a fraction
+    of what rays from several views cost."""
     views = [views[i] for i in torch.randperm(len(views), generator=generator).tolist()[:IMAGES]]
     views = [mirrored_view(v) if float(torch.rand(1, generator=generator)) < MIRRORED else v for v in views]
     # All without depth or none: norms take their statistics from images of one kind.

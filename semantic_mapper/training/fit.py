@@ -25,14 +25,14 @@ State = dict[str, torch.Tensor]
 
 @dataclass(frozen=True, slots=True)
 class FitProgress:
-    """State after a step: ``fraction`` of the budget, last training loss, held-out loss and accuracy (NaN at first)."""
+    """State after a step."""
 
     step: int
-    fraction: float
-    loss: float
-    held_out_loss: float = math.nan
+    fraction: float  # of the budget
+    loss: float  # of the step
+    held_out_loss: float = math.nan  # of the last look
     held_out_accuracy: float = math.nan
-    best: bool = False
+    best: bool = False  # whether this step's look was the best so far
 
 
 OnProgress = Callable[[FitProgress], None]
@@ -64,14 +64,9 @@ class Fitted(NamedTuple):
 class Budget:
     """How long a fit may take, who follows it, and who may end it; it begins now.
 
-    Args:
-        seconds: Of wall-clock time, the last look at held-out rays included; 0 = only steps count.
-        steps: 0 = only seconds count.
-        looks: At held-out rays, over the whole budget.
-        on_progress: Called after every step.
-        stopped: Called before every step; once it returns something true, the fit ends.
-
-    Raises ConfigError: neither seconds nor steps.
+    Wall-clock ``seconds`` include the last look at held-out rays; 0 = only ``steps`` count, and the other way round.
+    ``looks``: over the whole budget. ``stopped``: asked before every step; once it returns something true, the fit
+    ends. Raises ConfigError: neither seconds nor steps.
     """
 
     def __init__(
@@ -117,8 +112,7 @@ class Budget:
 
     def part(self, until: float, *, steps: int | None = None) -> Budget:
         """The budget of the next part of a fit, which ends at a fraction of this one: its time, and its progress.
-        ``until``: A part that comes late has a twentieth of the time until there at least. ``steps``: of the part; None
-        = as many as the whole may have."""
+        A late part has a twentieth of the time until there at least. ``steps``: None = those of the whole."""
         first, self._given = self._given, until
         seconds = max(until * self.seconds - self.elapsed_s, 0.05 * until * self.seconds)
 
@@ -158,10 +152,10 @@ class HeldOut:
 
 
 def fit(learn: Callable[[float], float | None], budget: Budget, held_out: HeldOut | None = None) -> int:
-    """Learn until the budget is used; ``held_out`` then has the weights that were best.
+    """Learn until the budget is used; ``held_out`` then has the weights that were best. Returns the number of steps.
 
     A fit that is stopped ends after one more look. ``learn``: one step, at a fraction of the budget; returns its loss,
-    None = there was nothing to learn from. Returns the number of steps.
+    None = there was nothing to learn from.
     """
     step, stale = 0, 0
     loss_there, accuracy = (math.nan, math.nan) if held_out is None else (held_out.loss, held_out.accuracy)

@@ -92,16 +92,10 @@ def fit_grid(
     box: GridConfig | None = None,
     leave_out: LeaveOut | None = None,
 ) -> GridFit:
-    """Fit a grid to posed images.
-
-    Args:
-        frames: Of a scene that stands still, with rigid poses; sizes and cameras may differ.
-        budget: None = that of ``config``; without steps those of ``config.grid``.
-        box: Instead of the one that ``config`` describes.
-
-    Raises FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
-    colour. ConfigError: a box that cannot be.
-    """
+    """Fit a grid to posed images of a scene that stands still, with rigid poses; sizes and cameras may differ.
+    ``budget``: None = that of ``config``; without steps those of ``config.grid``. ``box``: instead of the one that
+    ``config`` describes. Raises FrameError: too few frames, poses that only turn, or held-out views rendered hardly
+    better than by their mean colour. ConfigError: a box that cannot be."""
     budget = budget or Budget(config.seconds, config.steps or config.grid.steps)
     every = config.grid.held_out
     held_out = frames[every - 1 :: every] if every else []
@@ -120,19 +114,15 @@ def fit_grid(
     if psnr < mean_psnr + MIN_GAIN_DB and complete:
         raise FrameError(
             f"held-out views are rendered with {psnr:.1f} dB, hardly better than by their mean colour "
-            f"({mean_psnr:.1f} dB): poses do not fit the images, or {steps} steps are too few. Poses are "
-            "T_world_camera in metres, camera axes x right, y down, z forward; the scene must stand still, and the box "
-            "must hold what is seen"
+            f"({mean_psnr:.1f} dB): {steps} steps are too few, the box does not hold what is seen, or poses are not "
+            "T_world_camera in metres, camera axes x right, y down, z forward"
         )
     return GridFit(grid, steps, psnr, tuple(seen), np.exp(fitter.log_gain).astype(np.float32))
 
 
 def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> SceneGrid:
-    """A grid whose density is that of the measured surface; colours are grey.
-
-    Density is Laplace-CDF(-distance) / beta with beta = half a voxel, of the distance in voxels, positive before the
-    surface. What was not observed has the raw density ``unseen``: haze, for images to clear or fill.
-    """
+    """A grid whose density is that of the measured surface: Laplace-CDF(-distance) / beta, of the distance in voxels,
+    positive before the surface. What was not observed has the raw density ``unseen``; colours are grey."""
     distance, weight = np.zeros(config.shape, np.float32), np.zeros(config.shape, np.float32)
     T_world_grid = np.diag((config.voxel_m, config.voxel_m, config.voxel_m, 1.0))
     T_world_grid[:3, 3] = config.origin_m
@@ -157,11 +147,11 @@ def render_frame(grid: SceneGrid, rays: FrameRays, frame: int, near_m: float) ->
     """Colour (H, W, 3) in [0, 1] and z (H, W) in metres of a frame, 0 where less than half of the light is stopped."""
     with torch.no_grad():
         batch = rays.rays(rays.pixels_of(frame), near_m)
-        marched = grid.march(batch)
-        weight = marched.weight / marched.weight.sum(1, keepdim=True).clamp_min(1e-6)
-        colour = (weight[..., None] * grid.colour(marched.points)).sum(1) * (1 - marched.light)[:, None]
-        colour += marched.light[:, None] * grid.sky_colour(batch.direction)
-        depth = (weight * marched.z).sum(1) * (marched.light < 0.5)
+        samples = grid.march(batch)
+        weight = samples.weight / samples.weight.sum(1, keepdim=True).clamp_min(1e-6)
+        colour = (weight[..., None] * grid.colour(samples.points)).sum(1) * samples.opacity[:, None]
+        colour += samples.light[:, None] * grid.sky_colour(batch.direction)
+        depth = (weight * samples.z).sum(1) * (samples.light < 0.5)
     size = rays.image_size(frame)
     return colour.numpy().reshape(*size, 3), depth.numpy().reshape(size)
 
@@ -332,10 +322,10 @@ def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32
 def fit_geometry(
     task: FitTask, shape: GridFieldConfig, kind: str, until: float, leave_out: LeaveOut | None = None
 ) -> tuple[GridField, GridFit]:
-    """A field of a kind that stands on a grid, which shows the frames, and how well it does.
+    """A field of a kind that stands on a grid, which shows the frames, within a fraction of the budget.
 
     ``shape`` is the config of the kind, but for the box: that is the one of ``task.start`` if it is fitted, unless
-    ``config.grid`` names one. ``until`` is a fraction of the budget. Raises what ``fit_grid`` raises."""
+    ``config.grid`` names one. Raises what ``fit_grid`` raises."""
     start, config = task.start, task.config
     part = task.budget.part(until, steps=config.steps or config.grid.steps)
     box = start.config.grid if isinstance(start, GridField) and start.fitted and config.grid.box_m is None else None
@@ -384,9 +374,7 @@ def trunk_optimiser(trunk: Trunk, *others: nn.Module) -> torch.optim.Adam:
 
 def fit_trunk(field: GridField, geometry: GridFit, config: FinetuneConfig, budget: Budget) -> float:
     """Fit features, trunk and colour head to the frames of a grid's fit; the geometry stays.
-
-    Returns the PSNR of the last steps' rays in dB.
-    """
+    Returns the PSNR of the last steps' rays in dB."""
     assert field.trunk is not None
     rng = np.random.default_rng(config.seed)
     rays = frame_rays(geometry.frames, config.width)

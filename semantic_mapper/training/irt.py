@@ -74,10 +74,9 @@ class LabelledRays:
 
 
 def fit_irt(task: FitTask) -> Fitted:
-    """Fit an ``IRT``: geometry and texture from all frames, classes from those with labels.
-
-    ``budget.steps``, if not 0, is the number of steps of each of its three parts. Raises FrameError: no labelled frame,
-    one class only, or what ``fit_grid`` refuses. WeightsError: ``start`` has other classes."""
+    """Fit an ``IRT``: geometry and texture from all frames, classes from those with labels. ``budget.steps``, if not 0,
+    are those of each of its three parts. Raises FrameError: no labelled frame, one class only, or what ``fit_grid``
+    refuses. WeightsError: ``start`` has other classes."""
     start, config, budget, labelled = task.start, task.config, task.budget, task.labelled
     if start is not None and start.label_set != task.label_set:
         raise WeightsError(
@@ -142,8 +141,11 @@ class ClassFit:
     def run(self, budget: Budget) -> tuple[HeldOut, int]:
         """Learn until the budget is used; the field then has the weights that were best on what was held out.
         Returns these weights, and the number of steps."""
-        held_out = HeldOut(self._look, self._state, best=self._state())
-        steps = 0
+
+        def state() -> State:
+            return {name: p.detach().clone() for name, p in self.learned.items()}
+
+        held_out, steps = HeldOut(self._look, state, best=state()), 0
         if not budget.stopped():
             carry_labels(self.field, self.data.rays, self.taught, self.config.grid.near_m)
             steps = fit(self._learn, budget, held_out)
@@ -187,9 +189,6 @@ class ClassFit:
         self.field.train()
         count = len(self.looked_at)
         return (sum(losses) / count, right / count) if count else (math.inf, math.nan)
-
-    def _state(self) -> State:
-        return {name: p.detach().clone() for name, p in self.learned.items()}
 
     def _samples(self, pixels: torch.Tensor, *, with_depth: bool, jitter: torch.Tensor | None = None) -> RaySamples:
         rays = self.data.rays.rays(pixels.numpy(), self.config.grid.near_m)

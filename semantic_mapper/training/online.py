@@ -55,9 +55,7 @@ class Kept:
 
 class KeyframePool:
     """A bounded set of labelled keyframes in the classes of the weights' label set.
-
-    Of ``held_out_every`` keyframes the last one is held out, for good; past ``capacity`` the oldest is dropped.
-    """
+    Of ``held_out_every`` keyframes the last one is held out, for good; past ``capacity`` the oldest is dropped."""
 
     def __init__(self, label_set: LabelSet, *, held_out_every: int, capacity: int) -> None:
         self._label_set = label_set
@@ -80,11 +78,8 @@ class KeyframePool:
         return tuple(self._kept.values())
 
     def add(self, frame: PosedFrame, label_set: LabelSet) -> None:
-        """Add a keyframe; one of the same camera and time is replaced, and no longer validated.
-
-        Its classes are translated by name; those that the weights lack are not learned. Raises FrameError, PoseError,
-        LabelError: it cannot be learned from; nothing has changed.
-        """
+        """Add a keyframe, its classes translated by name; one of the same camera and time is replaced, and no longer
+        validated. Raises FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed."""
         frame = self._translated(frame, label_set)
         before = self._kept.pop(key_of(frame), None)
         self._received += before is None
@@ -181,13 +176,12 @@ def learn(
     on_progress: OnProgress | None = None,
     on_judged: Callable[[], None] = lambda: None,
 ) -> OnlineResult:
-    """Finetune ``current`` on the keyframes, and compare both on those held out.
+    """Finetune ``current`` on the keyframes, and compare both on those held out, each as the mapper would use it: with
+    the labels of the keyframes that it was finetuned on known.
 
-    Each is judged as the mapper would use it: with the labels of the keyframes that it was finetuned on known.
     ``keyframes``: at least two to learn from and one to judge by. ``on_progress, on_judged``: called after every step,
-    and every held-out keyframe. What either raises ends the round. Raises FrameError: too few keyframes, or those held
-    out have nothing to judge by. WeightsError: a kind of field whose encoder cannot rest, or one that is not trained
-    yet.
+    and every held-out keyframe; what either raises ends the round. Raises FrameError: too few keyframes, or those held
+    out have nothing to judge by. WeightsError: a kind of field whose encoder cannot rest, or an untrained one.
     """
     train, held_out = keyframes.train, keyframes.held_out
     if len(train) < 2 or not held_out:
@@ -245,11 +239,8 @@ def judge(
     config: OnlineConfig,
     on_judged: Callable[[], None] = lambda: None,
 ) -> list[ConfusionMatrix]:
-    """What a field says of the held-out keyframes against their labels, at the same rays whatever the field.
-
-    Each is rendered as a mapper would: from the keyframes that see most of it, and from its own image without labels.
-    ``sources``: keyframes to render from, with the labels that are known to the field.
-    """
+    """What a field says of the held-out keyframes against their labels, at the same rays whatever the field. Each is
+    rendered as a mapper would: from the ``sources``, with their labels, that see most of it, and from its own image."""
     sampling, label_set = config.finetune.step.sampling, model.label_set
     views = [view_from_frame(f, label_set, config.finetune.width) for f in (*sources, *held_out)]
     overlap = view_overlap(views)

@@ -41,22 +41,17 @@ class LabelledView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayTargets:
-    """What R query rays should render to: channel (R,) int64, rgb (R, 3), depth_m (R,) with 0 = none.
+    """What R query rays should render to."""
 
-    ``weight`` (R,) is what each counts in the class loss; None = all alike.
-    """
-
-    channel: torch.Tensor
-    rgb: torch.Tensor
-    depth_m: torch.Tensor
-    weight: torch.Tensor | None = None
+    channel: torch.Tensor  # (R,) int64
+    rgb: torch.Tensor  # (R, 3)
+    depth_m: torch.Tensor  # (R,), 0 = none
+    weight: torch.Tensor | None = None  # (R,) what each counts in the class loss; None = all alike
 
 
 def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> LabelledView:
     """Resize a frame to the working width; colours by area, depth and labels by nearest pixel.
-
-    Depth that was computed from pictures is what the view should render to where it is sure.
-    """
+    Depth that was computed from pictures is what the view should render to where it is sure."""
     intrinsics = working_intrinsics(frame.intrinsics, width)
     if frame.label is None:
         channel = np.full((intrinsics.height, intrinsics.width), -1, np.int64)
@@ -146,9 +141,8 @@ def draw_pixels(
 def query_rays(
     view: LabelledView, flat_index: torch.Tensor, *, near_m: float, far_m: float, prior: torch.Tensor | None
 ) -> tuple[RayBatch, RayTargets]:
-    """Rays through chosen pixels of a view, with what they should render to.
-    ``flat_index``: (R,) row-major pixel indices. ``prior``: (R,) depth priors in metres, 0 = none; None for none at
-    all."""
+    """Rays through pixels ``flat_index`` (R,), row by row, of a view, with what they should render to.
+    ``prior``: (R,) depth priors in metres, 0 = none; None for none at all."""
     width = view.intrinsics.width
     pixels = torch.stack((flat_index % width, flat_index // width), dim=-1).float()
     rays = pixel_rays(pixels, view.intrinsics, view.T_world_camera, near_m=near_m, far_m=far_m, prior_depth_m=prior)
@@ -174,10 +168,9 @@ def guided_rays(
 ) -> tuple[RayBatch, RayTargets, torch.Tensor]:
     """Rays of a training step through chosen pixels (R,), what they should render to, and sample depths (R, N).
 
-    Args:
-        noise: Sigma of the depth prior's error as a fraction of z; computed depth has errors of its own.
-        withheld: How often there is no depth prior; ``blind`` = always.
-        samples_without_depth: Of a ray, in steps without a depth prior. One ray in ``thinning`` is rendered in these.
+    ``noise``: sigma of the depth prior's error as a fraction of z; computed depth has errors of its own. ``withheld``:
+    how often there is no depth prior; ``blind`` = always. Without one, a ray has ``samples_without_depth``, and one ray
+    in ``thinning`` is rendered.
     """
     error = 1 + noise * torch.randn(len(flat_index), generator=generator)
     blind = float(torch.rand(1, generator=generator)) < withheld or blind

@@ -9,24 +9,22 @@ from semantic_mapper.types import UInt8
 
 from .rooms import walk
 
-
-def pictures() -> list[UInt8]:
-    return [f.rgb for f in walk()[:12]]
+PICTURES: list[UInt8] = [f.rgb for f in walk()[:12]]
 
 
 def test_a_walk_of_sharp_pictures_gives_no_cause_for_complaint_and_a_dim_one_is_not_blurred() -> None:
     checker = PictureChecker()
-    assert [checker.look(rgb) for rgb in pictures()] == [()] * 12
+    assert [checker.look(rgb) for rgb in PICTURES] == [()] * 12
     assert not checker.counters and checker.warnings == ()
-    assert "blurred" not in checker.look((pictures()[-1] * 0.5).astype(np.uint8))
+    assert "blurred" not in checker.look((PICTURES[-1] * 0.5).astype(np.uint8))
 
 
 @pytest.mark.parametrize("name", ["dark", "blurred", "exposure_jump"])
 def test_what_is_wrong_with_a_picture_is_named_and_counted(name: str) -> None:
     checker = PictureChecker()
-    for rgb in pictures()[:-1]:
+    for rgb in PICTURES[:-1]:
         checker.look(rgb)
-    last = pictures()[-1]
+    last = PICTURES[-1]
     spoiled = {
         "dark": last // 16,
         "blurred": cv2.blur(last, (41, 1)),

@@ -45,15 +45,15 @@ class Halves:
         return FieldRender(logits, rays.prior_depth_m, ones, torch.zeros(len(u), 3), ones, known)
 
 
-def sparse(field: Halves, prior: np.ndarray | None = None, fraction: float = 0.99, rgb: np.ndarray | None = None):
-    prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
-    rgb = np.full((30, 40, 3), 90, np.uint8) if rgb is None else rgb
+PRIOR, GREY = np.full((30, 40), 2.0, np.float32), np.full((30, 40, 3), 90, np.uint8)
+
+
+def sparse(field: Halves, prior: np.ndarray = PRIOR, fraction: float = 0.99, rgb: np.ndarray = GREY):
     return render_sparse_view(View(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128), rgb, fraction)  # type: ignore[arg-type]
 
 
-def dense(field: Halves, prior: np.ndarray | None = None):
-    prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
-    return render_view(View(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128))  # type: ignore[arg-type]
+def dense(field: Halves):
+    return render_view(View(field, NOTHING, CAMERA, np.eye(4), PRIOR, SAMPLING, 128))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("border", [15.5, 16.5, 17.5, 18.5])
@@ -69,7 +69,7 @@ def test_a_border_between_classes_is_found_to_the_pixel_with_a_fifth_of_the_rays
 
 
 def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_own():
-    prior = np.full((30, 40), 2.0, np.float32)
+    prior = PRIOR.copy()
     prior[:, 31] = 1.0  # a pole, one pixel wide, between the columns of every coarser grid
     _, _, depth, _ = sparse(Halves(), prior)
     np.testing.assert_array_equal(depth[:, 31], 1.0)
@@ -77,7 +77,7 @@ def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_
 
 
 def test_the_fraction_is_a_limit_and_the_most_uncertain_go_first():
-    prior = np.full((30, 40), 2.0, np.float32)
+    prior = PRIOR.copy()
     prior[10] = 1.0
     needed = sparse(Halves(17.5))[3]
     p, _, _, rays = sparse(Halves(17.5), prior, fraction=needed / 1200)

@@ -66,18 +66,16 @@ def assert_unknown(render: FieldRender) -> None:
 
 def assert_gradients_are_right(field: LearnedField, *, labelled: bool = False) -> None:
     """All parameters through encoding and rendering, every output, in double precision, against finite differences.
-
-    Args:
-        labelled: The first source view has known labels, stripes of all classes; the others have none.
-    """
+    ``labelled``: the first source view has known labels, stripes of all classes; the others have none."""
     field = field.double().train()
-    views = wall_sources(POSES[:2])
-    views = SourceViews(*(t.double() for t in (views.rgb, views.depth_m, views.K, views.T_world_camera)))
-    views = SourceViews(
-        views.rgb[..., ::2, ::2].contiguous(), views.depth_m[:, ::2, ::2], _halved(views.K), views.T_world_camera
-    )
+    full = wall_sources(POSES[:2])
+    images = full.rgb[..., ::2, ::2].contiguous(), full.depth_m[:, ::2, ::2]
+    cameras = full.K * torch.tensor([[0.5], [0.5], [1.0]]), full.T_world_camera
+    views = SourceViews(*(t.double() for t in (*images, *cameras)))
     if labelled:
-        views = replace(views, channel=_striped(views))
+        channel = torch.full_like(views.depth_m, -1, dtype=torch.int64)
+        channel[0] = torch.arange(channel.shape[2]) // 4 % len(LABELS)
+        views = replace(views, channel=channel)
     rays = wall_rays(POSES[1], step=500)
     rays = RayBatch(*(t.double() for t in (rays.origin, rays.direction, rays.near_m, rays.far_m, rays.prior_depth_m)))
     z = sample_guided(rays, SamplingConfig(guided=3, free_space=0))
@@ -92,16 +90,3 @@ def assert_gradients_are_right(field: LearnedField, *, labelled: bool = False) -
 
     parameters = tuple(field.parameters())
     assert torch.autograd.gradcheck(outputs, parameters, fast_mode=True, atol=1e-8, rtol=1e-3)
-
-
-def _striped(views: SourceViews) -> torch.Tensor:
-    """Labels (m, H, W) of the first view, columns of each class in turn; none of the others."""
-    channel = torch.full_like(views.depth_m, -1, dtype=torch.int64)
-    channel[0] = torch.arange(channel.shape[2]) // 4 % len(LABELS)
-    return channel
-
-
-def _halved(K: torch.Tensor) -> torch.Tensor:
-    half = K.clone()
-    half[:, :2] = K[:, :2] / 2
-    return half

@@ -84,8 +84,7 @@ class SceneGrid(nn.Module):
     """Raw density and raw colour at the vertices of a grid; trilinear between them, then softplus and sigmoid.
 
     ``values`` (X, Y, Z, 4) holds raw density, red, green and blue; ``occupied`` tells which cells rays may skip;
-    ``sky`` (16, 32, 3) are raw colours by direction, for rays that leave the box. They are parameters without
-    gradients: fits that want some ask for them. All axes are the world's.
+    ``sky`` (16, 32, 3) are raw colours by direction, for rays that leave the box. Fits ask for their gradients.
     """
 
     occupied: torch.Tensor
@@ -141,14 +140,9 @@ class SceneGrid(nn.Module):
         texel, weight = sky_texels(direction)
         return (torch.sigmoid(self.sky.flatten(0, 1))[texel] * weight[..., None]).sum(1)
 
-    @staticmethod
-    def optical_depth(raw: torch.Tensor) -> torch.Tensor:
-        """Optical depth a voxel of raw densities."""
-        return functional.softplus(raw + BIAS)
-
     def alpha(self) -> torch.Tensor:
         """Opacity (X, Y, Z) of a voxel at each vertex."""
-        return -torch.expm1(-self.optical_depth(self.values[..., 0]))
+        return -torch.expm1(-functional.softplus(self.values[..., 0] + BIAS))
 
     def update_occupied(self) -> None:
         """Find the cells that rays may skip."""
@@ -192,11 +186,9 @@ def sky_texels(direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def grid_box(
     low_m: tuple[float, ...], high_m: tuple[float, ...], long_side: int, voxel_m: float | None = None
 ) -> GridConfig:
-    """The grid of a box with ``long_side`` vertices along its longest side, or of voxels of this size.
-
-    A box that would have more than 16 M voxels gets larger ones. Raises ConfigError: a box without a volume, or one
-    that is too large for ``voxel_m``, with the size that fits.
-    """
+    """The grid of a box with ``long_side`` vertices along its longest side, or more distant ones where these would be
+    more than 16 M; or of voxels of this size. Raises ConfigError: a box without a volume, or one that is too large for
+    ``voxel_m``, with the size that fits."""
     sides = [high - low for low, high in zip(low_m, high_m, strict=True)]
     if not all(math.isfinite(s) and s > 0 for s in sides):
         raise ConfigError(f"the box from {low_m} to {high_m} m has no volume; give lower corner, then upper corner")
@@ -244,10 +236,8 @@ def encoded_size(dimensions: int, frequencies: int) -> int:
 
 
 def relu_layers(c_in: int, width: int, count: int) -> nn.Sequential:
-    """``count`` linear layers, each with a ReLU: (..., c_in) -> (..., width).
-
-    He's initialisation, as NeRF's successors have it: with torch's own, a plain MLP learns far slower.
-    """
+    """``count`` linear layers, each with a ReLU: (..., c_in) -> (..., width). He's initialisation, as NeRF's successors
+    have it: with torch's own, a plain MLP learns far slower."""
     layers: list[nn.Module] = []
     for i in range(count):
         layer = nn.Linear(c_in if i == 0 else width, width)
@@ -290,9 +280,8 @@ class Trunk(nn.Module):
 class GridField(LearnedField):
     """Geometry and colour of one scene, without classes.
 
-    Colour, depth and opacity are rendered wherever the grid has them. A ray is *known* where the field can say a
-    class, which this kind nowhere can: its logits are zeros. A kind that can overrides ``classify``. Of the sampling
-    only ``near_m`` counts: where rays are sampled, the grid says.
+    A ray is *known* where the field can say a class, which this kind nowhere can: its logits are zeros. A kind that can
+    overrides ``classify``. Of the sampling only ``near_m`` counts: where rays are sampled, the grid says.
     """
 
     kind: ClassVar[str] = "grid"
@@ -319,10 +308,7 @@ class GridField(LearnedField):
         return int(self.fitted_steps) > 0
 
     def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
-        """Class logits (R, L) of rays, composited, and where they are known (R,).
-
-        Override it, and ``known`` where opacity is not what decides. The base knows no classes.
-        """
+        """Class logits (R, L) of rays, composited, and where they are known (R,); the base knows no classes."""
         count = len(samples.light)
         none = torch.zeros(count, dtype=torch.bool, device=samples.z.device)
         return samples.z.new_zeros(count, len(self.label_set)), none

@@ -33,17 +33,15 @@ TOLERANCE = 0.03  # relative difference of depth at which a carried label's vote
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayTexture:
-    """Texture (R, 32) of each ray's own pixel, 0 where ``there`` (R,) is False: its image is not among the views."""
+    """Texture of each ray's own pixel."""
 
-    values: torch.Tensor
-    there: torch.Tensor
+    values: torch.Tensor  # (R, 32), 0 where none is there
+    there: torch.Tensor  # (R,) whether the ray's image is among the views
 
 
 class TextureNet(nn.Module):
     """Texture of images: three convolutions.
-
-    Images are continued beyond their edges, so that a pixel's texture is that of its patch wherever it lies.
-    """
+    Images are continued beyond their edges, so that a pixel's texture is that of its patch wherever it lies."""
 
     layers: tuple[int, ...] = (3, 16, 32, TEXTURE)  # channels
     kernel = 3
@@ -88,7 +86,10 @@ class IRT(GridField):
         )
         self.beyond = nn.Parameter(torch.zeros(WIDTH))  # what light that no point stops stands for
         self.carried = CarriedLabels(config.carried, config.carried_size, classes) if config.carried else None
-        self.vote = vote_layer(self.carried.channels, classes) if self.carried is not None else None
+        self.vote = None if self.carried is None else nn.Linear(classes + 1, classes, bias=False)
+        if self.vote is not None:  # starts by believing the votes
+            nn.init.zeros_(self.vote.weight)
+            self.vote.weight.data[:, :classes] = VOTE_START * torch.eye(classes)
         self.classifier = nn.Linear(WIDTH + (TEXTURE if joined else 0), classes)
         self._joined = joined
 
@@ -145,9 +146,7 @@ def surface(samples: RaySamples) -> torch.Tensor:
 
 def at_measured(samples: RaySamples, box: GridConfig) -> RaySamples:
     """Rays whose depth was measured, inside the box, end there; depth that was filled in from other pixels ends none.
-
-    Samples elsewhere fade, and one more at that depth takes the rest.
-    """
+    Samples elsewhere fade, and one more at that depth takes the rest."""
     rays = samples.rays
     prior = rays.prior_depth_m if rays.measured is None else rays.prior_depth_m * rays.measured
     xyz = samples.rays.origin + prior[:, None] * samples.rays.direction
@@ -164,15 +163,6 @@ def at_measured(samples: RaySamples, box: GridConfig) -> RaySamples:
         torch.cat((weight, rest[:, None]), 1),
         samples.light * ~measured,
     )
-
-
-def vote_layer(channels: int, classes: int) -> nn.Linear:
-    """Carried votes (R, L + 1) -> logits; it starts by believing them."""
-    layer = nn.Linear(channels, classes, bias=False)
-    nn.init.zeros_(layer.weight)
-    with torch.no_grad():
-        layer.weight[:, :classes] = VOTE_START * torch.eye(classes)
-    return layer
 
 
 def no_texture(rays: RayBatch) -> RayTexture:
@@ -280,11 +270,6 @@ class CarriedLabels(nn.Module):
         self.register_buffer("channel", torch.full((frames, *size), -1, dtype=torch.int16))
         self.register_buffer("K", torch.eye(3, dtype=torch.float64).repeat(frames, 1, 1))
         self.register_buffer("T_camera_world", torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1))
-
-    @property
-    def channels(self) -> int:
-        """Of what ``forward`` gives."""
-        return self.classes + 1
 
     def forward(self, xyz: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
         """Votes (R, L + 1) for points (R, 3): fractions by class, and how many there are, as n / (1 + n).
