@@ -222,11 +222,8 @@ def check_same_shape(path: Path, like: Checkpoint) -> None:
 
 
 def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
-    """A copy of a field for another label set: all weights kept, classifier rows carried over by class name.
-
-    Rows of classes that the old set does not know start round the mean row, without a preference for any old class.
-    Draws from torch's generator.
-    """
+    """A copy of a field for another label set: all weights kept, classifier rows carried over by class name. Rows of
+    classes that the old set does not know start round the mean row; draws from torch's generator."""
     adapted = build_field(model.kind, model.config, label_set, model.sampling)
     state = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     for name in model.class_rows:

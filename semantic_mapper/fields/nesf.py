@@ -278,10 +278,8 @@ def near_cells(xyz: Float32, cells: NDArray[np.int64]) -> Near:
 
 
 def smoothed(cells: Cells, level: CellLevel) -> torch.Tensor:
-    """Log-probabilities (M, L) of cells, centred, averaged over the surface round them.
-
-    A neighbour counts by a Gaussian of its distance, by its votes, and only where the surface has the same slope.
-    """
+    """Log-probabilities (M, L) of cells, centred, averaged over the surface round them. Neighbours count by a Gaussian
+    of their distance, by their votes, and only where the surface has the same slope."""
     table, distance = level.neighbours, torch.from_numpy((OFFSETS**2).sum(axis=1)).float()
     rise, votes, said = cells.x[:, UP_CHANNEL], cells.x[:, VOTES_CHANNEL], cells.x[:, SHAPE_CHANNELS:] / LOG_SCALE
     same = (_padded(rise[:, None])[table][..., 0] - rise[:, None]).abs() < SAME_SLOPE
@@ -388,11 +386,8 @@ class Nesf(nn.Module):
         return torch.cat((residual + smoothing * smoothed(cells, levels[0]), rest), dim=1)
 
     def read(self, answer: torch.Tensor, near: Near, log_p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Logits (N, L) at points, before the temperature, and the way (N, 3) to their objects' centres, metres.
-
-        The way is at most some ``FARTHEST_M`` long: it leads to the centre of what is small, and towards it elsewhere.
-        ``log_p`` (N, L) is what the map says there; zeros without votes.
-        """
+        """Logits (N, L) at points, before the temperature, and the way (N, 3) to their objects' centres, metres, about
+        ``FARTHEST_M`` at most. ``log_p`` (N, L) is what the map says there; zeros without votes."""
         here = torch.einsum("nkc,nk->nc", _padded(answer)[near.rows], near.weights)
         return log_p * (1 + here[:, -4:-3]) + here[:, :-4], here[:, -3:] * FARTHEST_M
 

@@ -55,9 +55,8 @@ def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> t
 def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
     """Negative log likelihood of the true depth of views that were given none; 0 without such views.
 
-    A Laplace distribution of log depth round the field's guess, as wide as the field says: near and far errors count
-    alike, and the width is learned with the guess. ``geometry``: (m, G, h, w) of ``EncodedViews``. ``given_m,
-    depth_m``: (m, H, W) depth that the field was given, and that was measured; 0 = none.
+    A Laplace distribution of log depth round the field's guess, as wide as the field says. ``geometry``: (m, G, h, w)
+    of ``EncodedViews``. ``given_m, depth_m``: (m, H, W) that the field was given, and that was measured; 0 = none.
     """
     size = geometry.shape[-2:]
     target = functional.interpolate(depth_m[:, None], size=size, mode="nearest-exact")[:, 0]
@@ -71,10 +70,8 @@ def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Ten
 def ray_loss(
     render: FieldRender, targets: RayTargets, weights: tuple[float, float, float] = (SEMANTIC, COLOUR, DEPTH)
 ) -> Loss:
-    """Weighted sum of the semantic, colour and depth losses over rays that some view sees.
-
-    Depth is compared in inverse metres where it is measured, so that near and far errors count by what a camera sees.
-    """
+    """Weighted sum of the semantic, colour and depth losses over rays that some view sees; depth is compared in inverse
+    metres, where it is measured."""
     known = render.known
     channel = torch.where(known, targets.channel, torch.full_like(targets.channel, IGNORE))
     semantic = semantic_loss(render.logits, channel, targets.weight)

@@ -193,7 +193,7 @@ def semantic_losses(
     weights: PanopticFitConfig,
 ) -> torch.Tensor:
     """Eq. 5 and 6: the pseudo labels (R,) ``channel`` against the fixed field and the learned one (R, K, L), and this
-    one against the boxes. ``group`` (L, L) says what the pseudo labels, -1 = none, may stand for."""
+    one against the boxes. ``group`` (L, L): what the pseudo labels, -1 = none, may stand for."""
     there = channel >= 0
     stands_for = group[channel.clamp_min(0)]
     count = there.sum().clamp_min(1)
@@ -280,10 +280,8 @@ class JointFit:
 
 
 def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> Bool:
-    """Which boxes (P,) may be in the image of a frame, none of those that are for certain (what hides them is ignored).
-
-    A box is taken as the ball round it, at the time of each frame, and an image as the cone through its corners.
-    Raises ConfigError: no box may be in any image."""
+    """Which boxes (P,) may be in the image of a frame: their balls at its time meet the cone through its corners; what
+    hides them is ignored. Raises ConfigError: no box may be in any image."""
     pose = np.array([frame.T_world_camera for frame in frames]).reshape(-1, 4, 4)
     cone = np.array([_half_angle(frame) for frame in frames])
     seen = np.zeros(len(boxes), np.bool_)
@@ -340,11 +338,9 @@ def shown_boxes(boxes: MovingBoxes, frames: Sequence[PosedFrame], rays: FrameRay
 
 
 def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, gains: Float32, near_m: float) -> None:
-    """Fill the grids of the boxes that move from depth images and colours; the scene's own grid is fitted.
-
-    What the scene itself has at a measured depth, such as the road under a car, is not of the box. Where no frame
-    measures the inside of a box, its core is full. ``gains`` (F, 3) is the exposure of the frames.
-    """
+    """Fill the grids of the boxes that move from depth images and colours with ``gains`` (F, 3). What the scene itself
+    has at a measured depth, such as the road under a car, is not of the box. Where no frame measures the inside of a
+    box, its core is full."""
     boxes = field.moving
     depths = [np.zeros_like(rays.depth_m) for _ in boxes.primitives]
     measured = np.zeros(len(boxes), np.int64)

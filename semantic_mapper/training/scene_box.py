@@ -86,9 +86,7 @@ def depth_bounds(frames: Sequence[PosedFrame]) -> Corners:
 
 def image_bounds(frames: Sequence[PosedFrame], far_m: float) -> Corners:
     """Corners of the box that images without depth show: each of their tiles at the depth of its matched features.
-
-    Where too few features match, what they see up to ``far_m``, with a warning.
-    """
+    Where too few features match, what they see up to ``far_m``, with a warning."""
     points = sparse_points(frames)
     shown = [_tiles(f, points) for f in frames]
     if sum(len(s) > 0 for s in shown) < max(2, len(frames) / 2):

@@ -27,10 +27,8 @@ DEPTH_LEVELS = 180.0  # of the guide for one dioptre
 
 
 def grow_strokes(frame: PosedFrame, label_set: LabelSet) -> PosedFrame:
-    """A frame whose label image has grown from its strokes; painted pixels stay as they are.
-
-    Depth ends strokes, too, where the frame has some. Raises FrameError: it has no label image.
-    """
+    """A frame whose label image has grown from its strokes, up to edges of image and depth; painted pixels stay.
+    Raises FrameError: it has no label image."""
     if frame.label is None:
         raise FrameError(f"frame seq={frame.seq} has no label image whose strokes could grow")
     k = working_intrinsics(frame.intrinsics, WIDTH)

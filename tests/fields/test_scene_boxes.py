@@ -50,6 +50,5 @@ def test_a_box_that_is_elsewhere_or_nowhere_changes_nothing(stamp_ns: int | None
 
 
 def test_a_box_that_nobody_has_filled_is_empty() -> None:
-    boxes = MovingBoxes(box(1.0).primitives, 0.2)
-    found = boxes.composite(scene(0), 8)
-    assert found.light.tolist() == [0.5, 0.5] and found.weight.sum(1).tolist() == [0.5, 0.5]
+    found = MovingBoxes(box(1.0).primitives, 0.2).composite(scene(0), 8)
+    assert found.light.tolist() == found.weight.sum(1).tolist() == [0.5, 0.5]

@@ -53,11 +53,8 @@ def test_a_fitted_grid_renders_colour_and_depth_and_claims_no_class() -> None:
     assert (render.depth_m - (WALL_M - rays.origin[:, 2]))[inside].abs().max() < 0.1
     assert (render.rgb - wall_colour(hit[:, 0], hit[:, 1]))[inside].abs().max() < 0.1
     assert not render.known.any() and not render.logits.any()
-
-
-def test_an_unfitted_grid_knows_nothing() -> None:
-    field = build_field("grid", GridFieldConfig(grid=BOX), LABELS)
-    assert_unknown(field.render(wall_rays(POSES[0], step=31), field.encode(wall_sources(POSES))))
+    field.fitted_steps.zero_()
+    assert_unknown(field.render(rays, field.encode(wall_sources(POSES))))
 
 
 def test_a_kind_says_what_samples_mean_and_only_where_something_is() -> None:

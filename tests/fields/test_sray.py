@@ -28,13 +28,11 @@ def test_reprojection_finds_the_same_wall_point_in_every_view():
     field = small_field()
     encoded = field.encode(wall_sources(POSES))
     rays = wall_rays(pose_at(0.05, 0.02), step=7)
-    z = torch.full((len(rays.origin), 2), 0.0)
     true_z = (WALL_M - rays.origin[:, 2]) / rays.direction[:, 2]
-    z[:, 0], z[:, 1] = true_z, true_z + 0.5
+    z = torch.stack((true_z, true_z + 0.5), 1)
     where = reproject(rays, z, encoded)
-    found = gather(encoded, where)
-    seen = where.valid[..., 0] & (where.uv[..., 0, 0] > 0) & (where.uv[..., 0, 0] < 23) & (where.uv[..., 0, 1] > 0)
-    seen &= where.uv[..., 0, 1] < 15
+    found, uv = gather(encoded, where), where.uv[:, :, 0]
+    seen = where.valid[..., 0] & ((uv > 0) & (uv < torch.tensor([23.0, 15.0]))).all(-1)
     points = rays.origin + true_z[:, None] * rays.direction
     expected = wall_colour(points[:, 0], points[:, 1]).expand(len(POSES), -1, -1)
     error = (found.rgb[:, :, 0] - expected).abs().amax(-1)[seen]

@@ -12,19 +12,15 @@ def candidate(*cells: int, stamp_ns: int = 0) -> Candidate:
     return Candidate(stamp_ns, np.array([[c, 0, 0] for c in cells], np.int64).reshape(-1, 3))
 
 
-def test_each_suggestion_counts_what_earlier_ones_show():
+def test_each_suggestion_counts_what_labelled_and_earlier_ones_show():
     frames = [candidate(1, 2, 3, 4), candidate(1, 2, 3), candidate(8, 9), candidate(4, 5)]
     found = suggest_frames(frames, 4)
     assert [s.index for s in found] == [0, 2, 3], "the second frame shows nothing that the first does not"
     # Of 11 pixels of the log, 8 fall in what the first one shows.
     assert [s.gain for s in found] == pytest.approx([8 / 11, 2 / 11, 1 / 11])
     assert [s.shown for s in found] == pytest.approx([8 / 11, 10 / 11, 1])
-
-
-def test_labelled_frames_are_not_suggested_and_what_they_show_counts_nothing():
-    frames = [candidate(1, 2, 3, 4), candidate(1, 2, 3), candidate(8, 9), candidate(4, 5)]
-    assert [s.index for s in suggest_frames(frames, 2, [0])] == [2, 3]
-    assert suggest_frames(frames, 2, [0])[0].shown == pytest.approx(10 / 11)
+    left = suggest_frames(frames, 2, [0])
+    assert [s.index for s in left] == [2, 3] and left[0].shown == pytest.approx(10 / 11)
     assert suggest_frames(frames, 2, [0, 2, 3]) == []
 
 

@@ -6,11 +6,7 @@ import torch
 
 from semantic_mapper.training.finetune import pick_views
 from semantic_mapper.training.losses import semantic_loss
-from semantic_mapper.training.views import (
-    LabelledView,
-    draw_pixels,
-    view_overlap,
-)
+from semantic_mapper.training.views import LabelledView, draw_pixels, view_overlap
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
