@@ -265,7 +265,7 @@ def run_task(task: Task, log: LogInput) -> bool:
     try:
         store = Store(task.store)
     except ConfigError as error:
-        raise StoreError(f"{socket.gethostname()}: {error}. Where nodes share no folder, --out is a bucket") from error
+        raise StoreError(f"{socket.gethostname()}: {error}. Without a shared folder --out must be a bucket") from error
     versions = _versions(log.url)
     source = f"sources/{_digest(log.url, *versions.values())}"
     known = store.find(source) if all(versions.values()) else None  # the log was read before
