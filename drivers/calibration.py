@@ -280,13 +280,6 @@ class _KalibrCamera(msgspec.Struct):
     resolution: tuple[_Side, _Side]
 
 
-def _load_yaml(path: Path) -> CameraIntrinsics:
-    plain = _read_yaml(path)
-    check_values(plain, "its values")
-    lowered = {_MESSAGE.get(key.lower(), key.lower()): value for key, value in plain.items()}
-    return _camera_info(lowered) if "camera_matrix" in lowered else _kalibr(plain)
-
-
 def _camera_info(plain: Mapping[str, Any]) -> CameraIntrinsics:
     flat = {
         key: value["data"] if isinstance(value, dict) and "data" in value else value for key, value in plain.items()
@@ -312,7 +305,7 @@ def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
     return lens_intrinsics(camera.distortion_model, camera.distortion_coeffs, (fx, fy, cx, cy), camera.resolution)
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _load_yaml(path: Path) -> CameraIntrinsics:
     yaml = YAML(typ="safe", pure=True)
     text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
     text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
@@ -324,4 +317,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not documents or not isinstance(documents[0], dict):
         raise ConfigError("holds no calibration")
     values = {str(key): value for key, value in cast("dict[Any, Any]", documents[0]).items()}
-    return {"distortion_model": "opencv", **values} if of_opencv else values
+    check_values(values, "its values")
+    lowered = {_MESSAGE.get(key.lower(), key.lower()): value for key, value in values.items()}
+    if "camera_matrix" not in lowered:
+        return _kalibr(values)
+    return _camera_info({"distortion_model": "opencv", **lowered} if of_opencv else lowered)

@@ -88,8 +88,11 @@ def calibrate_rig(
     """
     sights: list[dict[str, _Sight]] = []
     for views in instants:
-        found = {name: _sight(views[name], lens) for name, lens in cameras.items() if name in views}
-        own = {name: sight for name, sight in found.items() if sight is not None}
+        own: dict[str, _Sight] = {}
+        for name, lens in cameras.items():
+            pixels = ideal_pixels(views[name].pixels, lens) if name in views else None
+            if pixels is not None and (poses := board_poses(views[name].points, pixels, lens)):
+                own[name] = _Sight(views[name].points, pixels, poses[0][1])
         if len(own) > 1:
             sights.append(own)
     poses, rms_px, sigmas = _adjust_bundle(cameras, sights, _first_guess(list(cameras), sights))
@@ -109,12 +112,6 @@ def calibrate_rig(
             )
         rig[name] = RigCamera(pose, sum(name in own for own in sights), position, float(np.degrees(turn)))
     return rig, rms_px
-
-
-def _sight(view: BoardView, lens: CameraIntrinsics) -> _Sight | None:
-    pixels = ideal_pixels(view.pixels, lens)
-    poses = board_poses(view.points, pixels, lens)
-    return _Sight(view.points, pixels, poses[0][1]) if poses else None
 
 
 def _first_guess(names: Sequence[str], sights: Sequence[Mapping[str, _Sight]]) -> dict[str, Float64]:

@@ -79,7 +79,8 @@ class ViewGatherer:
         self.images += 1
         points, pixels = self._finder.find(image.rgb)
         before, self._last = self._last, None
-        if len(points) < MIN_CORNERS or _on_a_line(pixels):
+        spread = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False) if len(points) >= MIN_CORNERS else (0, 0)
+        if spread[1] <= FLAT * spread[0]:  # too few, or on a line
             return False
         self.seen += 1
         view = self._last = BoardView(name or f"image {image.seq}", image.stamp_ns, points, pixels)
@@ -155,11 +156,6 @@ def shortfalls(config: CalibrationConfig, views: int, counts: Float64, tilts: Fl
                 "the focal length cannot be distinguished from the distance"
             )
     return lacks
-
-
-def _on_a_line(pixels: Float64) -> bool:
-    spread = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < FLAT * spread[0])
 
 
 def _stands_still(before: BoardView | None, view: BoardView) -> bool:

@@ -343,17 +343,14 @@ class LoopCloser:
         if moved_m >= _SMALL[0] or turned_deg >= _SMALL[1]:
             kept = [e for e in self._waiting if e.a in poses and e.b in poses and edge.b - e.b <= _PATIENCE]
             self._counters["loops_refused"] += len(self._waiting) - len(kept)
-            other = next((e for e in kept if e.b != edge.b and self._agree(e, edge)), None)
+            # Two loops agree that move the same place to the same place.
+            move = poses[edge.a] @ edge.T_a_b
+            moves = [(e, poses[e.a] @ e.T_a_b @ invert_pose(poses[e.b]) @ poses[edge.b]) for e in kept if e.b != edge.b]
+            other = next((e for e, theirs in moves if within(theirs, move, _AGREE)), None)
             taken = [] if other is None else [edge, other]
             self._waiting = [*kept, edge] if other is None else [e for e in kept if e is not other]
         self._graph.edges.extend(taken)
         self._new.extend(taken)
-
-    def _agree(self, one: Edge, other: Edge) -> bool:
-        """Whether two loops move the same place to the same place."""
-        poses = self._graph.poses
-        motions = [poses[e.a] @ e.T_a_b @ invert_pose(poses[e.b]) for e in (one, other)]
-        return within(motions[0] @ poses[other.b], motions[1] @ poses[other.b], _AGREE)
 
     def _close(self) -> Mapping[int, Float64] | None:
         before, new = self._graph.poses, [e for e in self._new if e in self._graph.edges]

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from semantic_mapper.drivers.registry import FoundCamera, find_cameras, load_driver, open_camera
+from semantic_mapper.drivers.registry import FoundCamera, find_cameras, load_driver
 from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
 
@@ -40,10 +40,3 @@ def test_a_kind_that_cannot_be_used_or_searched_for_says_so_and_the_others_are_l
         load_driver("oak")
     found, unknown = find_cameras(("oak", "realsense", "v4l2"))
     assert found == [camera] and list(unknown) == ["oak", "realsense"] and unknown["realsense"] == "the bus is gone"
-
-
-def test_a_camera_is_made_of_plain_settings_that_are_checked() -> None:
-    camera = open_camera("opencv", {"source": "film.mp4", "uncalibrated": True}, "film", "launch.toml")
-    assert camera.warnings == ("not calibrated: the intrinsics are a guess, good for calibrating only",)
-    with pytest.raises(ConfigError, match=r"launch.toml: .*did you mean `source`"):
-        open_camera("opencv", {"sourc": "film.mp4"}, "film", "launch.toml")

@@ -3,26 +3,58 @@
 from __future__ import annotations
 
 import dataclasses
-import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from research.scenes import render_view
+from research.scenes import TEST_SEEDS, camera_path, make_room, render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.calibration import load_stereo, save_stereo
+from semantic_mapper.drivers.calibration import StereoCalibration, load_stereo, save_stereo
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.drivers.v4l2.devices import list_stereo
 from semantic_mapper.errors import CameraError, ConfigError
-from semantic_mapper.types import Float64
+from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
-from tests.drivers.stereo import pairs
-from tests.drivers.support import PATIENCE_S, until, write_calibration, write_film
+from tests.drivers.support import PATIENCE_S, write_calibration, write_film
 
 COUNT = 3
+LEFT = CameraIntrinsics(330.0, 330.0, 239.5, 179.5, 480, 360)
+RIGHT = CameraIntrinsics(334.0, 334.0, 242.0, 177.0, 480, 360)
+BASELINE_M = 0.12
+
+
+def T_left_right() -> Float64:  # noqa: N802 - a transform
+    """The right camera stands 12 cm aside, a little lower, and is turned by a degree, as cheap pairs are."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.radians((0.6, -1.0, 0.4)))[0]
+    T[:3, 3] = (BASELINE_M, 0.002, -0.001)
+    return T
+
+
+def the_pair(*, swapped: bool = False) -> StereoCalibration:
+    return StereoCalibration(LEFT, RIGHT, np.linalg.inv(T_left_right()), swapped)
+
+
+def write_pair(path: Path, *, swapped: bool = False) -> str:
+    save_stereo(path, the_pair(swapped=swapped), {"made_by": "a test"})
+    return str(path)
+
+
+def room_pairs(scene: object, poses: Sequence[Float64]) -> list[UInt8]:
+    """(H, 2 W, 3) RGB of each pose of the left camera; a little noise, as sensors have."""
+    rng = np.random.default_rng(5)
+    found: list[UInt8] = []
+    for T in poses:
+        left = render_view(scene, LEFT, T).rgb  # type: ignore[arg-type]
+        right = render_view(scene, RIGHT, T @ T_left_right()).rgb  # type: ignore[arg-type]
+        both = np.hstack((left, right)).astype(np.float32)
+        found.append(np.clip(both + rng.normal(0, 1.5, both.shape), 0, 255).astype(np.uint8))
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +66,9 @@ class Film:
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
-    scene, poses = pairs.room_poses(COUNT)
-    path = write_film(tmp_path_factory.mktemp("film") / "pair.avi", pairs.room_pairs(scene, poses))
+    scene = make_room(TEST_SEEDS[0])
+    poses = list(camera_path(scene, COUNT, TEST_SEEDS[0]))
+    path = write_film(tmp_path_factory.mktemp("film") / "pair.avi", room_pairs(scene, poses))
     return Film(path, scene, poses)
 
 
@@ -55,8 +88,8 @@ def images_of(film: Film, calibration: str, **settings: Any) -> list[CameraImage
 
 def test_the_depth_of_a_room_is_that_of_the_rectified_left_camera(film: Film, tmp_path: Path) -> None:
     """The errors that a third of a pixel makes: the room is 2 m away in the median, a pixel is 2.4 cm there."""
-    images = images_of(film, pairs.write_pair(tmp_path / "pair.toml"))
-    rectified = StereoDepth(pairs.pair(), 480, 0.4, 8.0)
+    images = images_of(film, write_pair(tmp_path / "pair.toml"))
+    rectified = StereoDepth(the_pair(), 480, 0.4, 8.0)
     assert len(images) == COUNT and [image.seq for image in images] == list(range(COUNT))
     for image, T_world_left in zip(images, film.poses, strict=True):
         truth = render_view(film.scene, image.intrinsics, T_world_left @ rectified.T_left_rectified)
@@ -71,7 +104,7 @@ def test_the_depth_of_a_room_is_that_of_the_rectified_left_camera(film: Film, tm
 
 def test_what_the_right_camera_does_not_see_has_no_depth() -> None:
     """A near board before a far wall hides a strip of it from the right camera, on the board's left."""
-    pair = pairs.pair()
+    pair = the_pair()
     matcher = StereoDepth(dataclasses.replace(pair, right=pair.left, T_right_left=shift(-0.1)), 480, 0.4, 8.0)
     focal = matcher.intrinsics.fx
     rng = np.random.default_rng(1)
@@ -98,16 +131,16 @@ def shift(x: float) -> Float64:
 def test_a_file_of_a_pair_reads_back_to_the_same_numbers_and_swapped_halves_are_put_right(
     film: Film, tmp_path: Path
 ) -> None:
-    lens = dataclasses.replace(pairs.LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
-    pair = dataclasses.replace(pairs.pair(swapped=True), left=lens)
+    lens = dataclasses.replace(LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
+    pair = dataclasses.replace(the_pair(swapped=True), left=lens)
     save_stereo(tmp_path / "pair.toml", pair, {"made_by": 'a "test"', "rms_px": 0.25})
     read = load_stereo(tmp_path / "pair.toml")
     assert (read.left, read.right, read.swapped) == (pair.left, pair.right, True)
     assert np.array_equal(read.T_right_left, pair.T_right_left)
-    both = pairs.room_pairs(film.scene, film.poses[:1])
+    both = room_pairs(film.scene, film.poses[:1])
     other = write_film(tmp_path / "pair.avi", [np.hstack(np.hsplit(image, 2)[::-1]) for image in both])
-    (swapped,) = images_of(dataclasses.replace(film, path=other), pairs.write_pair(tmp_path / "p.toml", swapped=True))
-    plain = images_of(film, pairs.write_pair(tmp_path / "q.toml"))[0]
+    (swapped,) = images_of(dataclasses.replace(film, path=other), write_pair(tmp_path / "p.toml", swapped=True))
+    plain = images_of(film, write_pair(tmp_path / "q.toml"))[0]
     assert np.abs(swapped.rgb.astype(int) - plain.rgb).mean() < 2
     assert swapped.depth_m is not None and (swapped.depth_m > 0).mean() > 0.85
 
@@ -130,16 +163,16 @@ def test_what_cannot_work_is_refused_before_the_device_is_opened(
     monkeypatch.chdir(tmp_path)
     write_calibration(tmp_path / "lens.toml")
     with pytest.raises(error, match=complaint):
-        stereo(Path("film.avi"), pairs.write_pair(tmp_path / "pair.toml"), **settings)
+        stereo(Path("film.avi"), write_pair(tmp_path / "pair.toml"), **settings)
 
 
 def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(film: Film, tmp_path: Path) -> None:
-    turned = dataclasses.replace(pairs.pair(), T_right_left=shift(0.1))
+    turned = dataclasses.replace(the_pair(), T_right_left=shift(0.1))
     save_stereo(tmp_path / "turned.toml", turned, {})
     with pytest.raises(ConfigError, match="the right camera is not next to the left one"):
         stereo(film.path, str(tmp_path / "turned.toml"))
     small = write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
-    camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))
+    camera = stereo(small, write_pair(tmp_path / "pair.toml"))
     with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 960x360"), camera:
         pass
 
@@ -149,19 +182,12 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     return make_machine(tmp_path, monkeypatch)
 
 
-def test_a_pair_that_is_unplugged_is_waited_for(machine: Machine, tmp_path: Path) -> None:
-    sensor = Sensor(card="Stereo", sizes=((960, 360), (64, 48)))
-    device = machine.plug(sensor, 0)
-    with stereo(device, pairs.write_pair(tmp_path / "pair.toml"), source={"stall_s": PATIENCE_S}) as camera:
-        images = iter(camera)
-        before = next(images)
-        assert before.rgb.shape == (360, 480, 3) and before.depth_m is not None and not before.depth_m.any()
+def test_a_pair_of_a_webcam_is_read_without_its_rectification(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(card="Stereo", sizes=((960, 360), (64, 48))), 0)
+    with stereo(device, write_pair(tmp_path / "pair.toml"), source={"stall_s": PATIENCE_S}) as camera:
+        image = next(iter(camera))
+        assert image.rgb.shape == (360, 480, 3) and image.depth_m is not None and not image.depth_m.any()
         assert camera.warnings == () and not camera.can_wait
-        machine.unplug(sensor)
-        until(lambda: any("no such camera" in text for text in camera.warnings))
-        plugged_ns = time.monotonic_ns()
-        machine.plug(sensor, 3)
-        assert next(image for image in images if image.stamp_ns > plugged_ns).seq > before.seq + 1
 
 
 def test_cameras_that_offer_images_side_by_side_are_listed(machine: Machine) -> None:
