@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,14 +18,14 @@ from numpy.typing import NDArray
 from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.geometry import invert_pose
-from semantic_mapper.imaging import resize_depth
+from semantic_mapper.geometry import invert_pose, scale_intrinsics
+from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
+from semantic_mapper.types import Float32, PosedFrame
 
 WIDTH, HEIGHT = 640, 480  # of the frames that are measured
 COARSE = (120, 160)  # size of the rendered view that is upsampled, as the pipeline has it
@@ -123,16 +122,10 @@ def _frames(log: Path, count: int) -> tuple[list[PosedFrame], LabelSet | None]:
 
 
 def _resized(frame: PosedFrame) -> PosedFrame:
-    if frame.rgb.shape[:2] == (HEIGHT, WIDTH):
-        return frame
-    x, y = WIDTH / frame.rgb.shape[1], HEIGHT / frame.rgb.shape[0]
-    k, label = frame.intrinsics, frame.label
-    intrinsics = CameraIntrinsics(k.fx * x, k.fy * y, (k.cx + 0.5) * x - 0.5, (k.cy + 0.5) * y - 0.5, WIDTH, HEIGHT)
-    rgb = np.asarray(cv2.resize(frame.rgb, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR), np.uint8)
-    if label is not None:
-        label = np.asarray(cv2.resize(label, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST_EXACT), label.dtype)
-    depth_m = resize_depth(frame, intrinsics)
-    return dataclasses.replace(frame, rgb=rgb, depth_m=depth_m, label=label, intrinsics=intrinsics)
+    k = scale_intrinsics(frame.intrinsics, WIDTH, HEIGHT)
+    label = None if frame.label is None else resize_label(frame.label, k)
+    rgb, depth_m = resize_rgb(frame, k), resize_depth(frame, k)
+    return dataclasses.replace(frame, rgb=rgb, depth_m=depth_m, label=label, intrinsics=k)
 
 
 class _Open3DFusion:

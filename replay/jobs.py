@@ -25,7 +25,7 @@ from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.evaluate import methods
-from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
+from semantic_mapper.replay.evaluate.things import PanopticTruth
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -145,7 +145,7 @@ def evaluate_log(
         panoptic = None
         if instances is not None:
             require_metres(source.info.scale_known, "instances")
-            panoptic = PanopticTruth(InstanceFolder(instances, source), stream_labels, checkpoint.label_set)
+            panoptic = PanopticTruth(instances, source, stream_labels, checkpoint.label_set)
         predictors = methods.field_predictors(bundle)
         if baseline_s:
             monitor.start(100)

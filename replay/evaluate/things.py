@@ -39,33 +39,6 @@ SEEN = "map seen from frames"  # the method whose figures are those of the finis
 MAX_FRAMES = 100  # that are kept; beyond that every second one goes
 
 
-class InstanceFolder:
-    """Images of object numbers of a log's frames: ``NNNNNN.png`` or ``CAMERA/NNNNNN.png``, uint8 or uint16, 0 = none.
-
-    NNNNNN is the number of the frame in the log, from 0. LabelError for a folder that holds none.
-    """
-
-    def __init__(self, path: Path, log: Log) -> None:
-        self.path = path
-        parts = enumerate(log.frame_parts())
-        self._number = {(envelope.source, envelope.stamp_ns): number for number, (envelope, _) in parts}
-        if not any(path.glob("*.png")) and not any(path.glob("*/*.png")):
-            raise LabelError(
-                f"{path}: has no images of objects; they are called by the number of their frame in the log, 000012.png"
-            )
-
-    def read(self, frame: PosedFrame) -> NDArray[np.integer[Any]] | None:
-        """Object numbers (H, W) of a frame; None where there is no image of it, LogError for a damaged one."""
-        name = f"{self._number[frame.camera_id, frame.stamp_ns]:06d}.png"
-        file = next((f for f in (self.path / frame.camera_id / name, self.path / name) if f.exists()), None)
-        if file is None:
-            return None
-        try:
-            return read_plane(file, "any", (frame.intrinsics.height, frame.intrinsics.width), "instance")
-        except BadFrameError as error:
-            raise LogError(str(error)) from error
-
-
 class ThingSurface:
     """The N surface voxels of a map as it is now, ``xyz`` (N, 3) in world metres, its ``things`` as queries find them,
     and the ``number`` (N,) of the thing of each voxel, -1 = none. MapError where lengths are not metres."""
@@ -110,13 +83,21 @@ class _View(NamedTuple):
 
 
 class PanopticTruth:
-    """True classes, ids of the map's ``label_set``, and objects of some frames.
+    """True classes, ids of the map's ``label_set``, and objects of some frames of a log.
 
-    Segments that are found of classes that the frames' ``stream_labels`` lack are as if nothing had been found.
+    Object numbers are images in a folder, uint8 or uint16, 0 = none: ``NNNNNN.png`` or ``CAMERA/NNNNNN.png``, by the
+    number of the frame in the log, from 0. Segments that are found of classes that the frames' ``stream_labels`` lack
+    are as if nothing had been found. Raises LabelError: the folder holds no image.
     """
 
-    def __init__(self, folder: InstanceFolder, stream_labels: LabelSet, label_set: LabelSet) -> None:
+    def __init__(self, folder: Path, log: Log, stream_labels: LabelSet, label_set: LabelSet) -> None:
         self._folder = folder
+        parts = enumerate(log.frame_parts())
+        self._number = {(envelope.source, envelope.stamp_ns): number for number, (envelope, _) in parts}
+        if not any(folder.glob("*.png")) and not any(folder.glob("*/*.png")):
+            raise LabelError(
+                f"{folder}: has no images of objects; they are called by the number of their frame, 000012.png"
+            )
         self._label_set = label_set
         shared = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name in stream_labels.names]
         self._shared = np.full(256, label_set.ignore_id, np.uint8)
@@ -128,12 +109,19 @@ class PanopticTruth:
     def add(self, frame: PosedFrame, truth: UInt8, found: Mapping[str, Callable[[], PanopticImage]] = {}) -> None:
         """Remember a frame whose objects are known, with its truth (H, W), at reduced size.
 
-        ``found`` gives, by method, what it says of the frame (H, W); called where objects are known.
+        ``found`` gives, by method, what it says of the frame (H, W); called where objects are known. Raises LogError:
+        the image of its objects is damaged.
         """
-        instance = self._folder.read(frame) if self._seen % self._stride == 0 else None
+        name = f"{self._number[frame.camera_id, frame.stamp_ns]:06d}.png"
+        places = self._folder / frame.camera_id / name, self._folder / name
+        file = next((place for place in places if place.exists()), None)
         self._seen += 1
-        if instance is None:
+        if file is None or (self._seen - 1) % self._stride:
             return
+        try:
+            instance = read_plane(file, "any", (frame.intrinsics.height, frame.intrinsics.width), "instance")
+        except BadFrameError as error:
+            raise LogError(str(error)) from error
         k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
         said = {name: _resized(ask(), k) for name, ask in found.items()}
         self._views.append(_View(frame.T_world_camera, k, _resized(PanopticImage(truth, instance), k), said))
@@ -167,7 +155,7 @@ class PanopticTruth:
 
     def _known_views(self) -> list[_View]:
         if not self._views:
-            raise LabelError(f"{self._folder.path}: has no image of any frame that is scored")
+            raise LabelError(f"{self._folder}: has no image of any frame that is scored")
         return self._views
 
     def _of_shared(self, found: PanopticImage) -> PanopticImage:

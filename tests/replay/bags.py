@@ -64,36 +64,19 @@ class Messages:
         K = np.array((k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1), np.float64)
         P = np.array((k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0), np.float64)
         roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
-        return self.make(
-            "sensor_msgs/CameraInfo",
-            self.header(stamp_ns, frame),
-            k.height,
-            k.width,
-            model,
-            np.array(lens, np.float64),
-            K,
-            np.eye(3).ravel(),
-            P,
-            0,
-            0,
-            roi,
-        )
+        head, lens_of = self.header(stamp_ns, frame), np.array(lens, np.float64)
+        values = head, k.height, k.width, model, lens_of, K, np.eye(3).ravel(), P, 0, 0, roi
+        return self.make("sensor_msgs/CameraInfo", *values)
 
     def transform(self, T: np.ndarray) -> Any:
-        position, rotation = _parts(T)
-        return self.make(
-            "geometry_msgs/Transform",
-            self.make("geometry_msgs/Vector3", *position),
-            self.make("geometry_msgs/Quaternion", *rotation),
-        )
+        return self._at("Transform", "Vector3", T)
 
     def pose(self, T: np.ndarray) -> Any:
-        position, rotation = _parts(T)
-        return self.make(
-            "geometry_msgs/Pose",
-            self.make("geometry_msgs/Point", *position),
-            self.make("geometry_msgs/Quaternion", *rotation),
-        )
+        return self._at("Pose", "Point", T)
+
+    def _at(self, kind: str, place: str, T: np.ndarray) -> Any:
+        rotation = self.make("geometry_msgs/Quaternion", *Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
+        return self.make(f"geometry_msgs/{kind}", self.make(f"geometry_msgs/{place}", *T[:3, 3].tolist()), rotation)
 
     def tf(self, stamp_ns: int, parent: str, child: str, T_parent_child: np.ndarray) -> Any:
         stamped = self.make(
@@ -192,7 +175,3 @@ def write_bag(path: Path, kind: Kind, events: Sequence[Event]) -> Path:
                 connections[topic] = writer.add_connection(bare, name, typestore=store, **of_node)
             writer.write(connections[topic], received_ns, serialize(message, name))
     return path
-
-
-def _parts(T: np.ndarray) -> tuple[list[float], list[float]]:
-    return T[:3, 3].tolist(), Rotation.from_matrix(T[:3, :3]).as_quat().tolist()

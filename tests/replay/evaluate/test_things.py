@@ -13,7 +13,7 @@ from research.scenes.sequence import room_views
 from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.evaluate.things import InstanceFolder, PanopticTruth
+from semantic_mapper.replay.evaluate.things import PanopticTruth
 from semantic_mapper.replay.log.sequence import open_log
 from tests.nodes.support import write_log
 from tests.small import INTRINSICS, tiny_config
@@ -40,7 +40,7 @@ def voxel_map() -> VoxelMap:
 
 def score(log_path: Path, folder: Path, voxel_map: VoxelMap, stream: LabelSet = ROOMS):
     with open_log(log_path) as log:
-        truth = PanopticTruth(InstanceFolder(folder, log), stream, ROOMS)
+        truth = PanopticTruth(folder, log, stream, ROOMS)
         for frame in log:
             assert frame.label is not None
             known = [ROOMS.id_of(name) for name in stream.names]

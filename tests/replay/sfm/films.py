@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -52,33 +52,3 @@ def box(data: bytes, *path: bytes) -> tuple[int, int]:
             raise AssertionError(f"no box {name!r}")
         start, end = at + 8, at + size
     return start - 8, size
-
-
-def set_frame_times(film: Path, durations: Sequence[int]) -> int:
-    """Give each frame of a film a duration of its own, as phones do; returns the units a second."""
-    data = bytearray(film.read_bytes())
-    way = (b"moov", b"trak", b"mdia")
-    header, _ = box(data, *way, b"mdhd")
-    units = struct.unpack(">I", data[header + 20 : header + 24])[0]
-    old, size = box(data, *way, b"minf", b"stbl", b"stts")
-    table = struct.pack(">II", 0, len(durations)) + b"".join(struct.pack(">II", 1, d) for d in durations)
-    new = struct.pack(">I4s", 8 + len(table), b"stts") + table
-    grown = len(new) - size
-    boxes = [box(data, *(*way, b"minf", b"stbl")[:n])[0] for n in range(1, 6)]
-    assert all(at < old for at in boxes) and box(data, b"mdat")[0] < boxes[0]  # offsets of frames stay true
-    for at in boxes:
-        struct.pack_into(">I", data, at, struct.unpack_from(">I", data, at)[0] + grown)
-    data[old : old + size] = new
-    total = sum(durations)
-    struct.pack_into(">I", data, header + 24, total)
-    film.write_bytes(bytes(data))
-    return units
-
-
-def set_rotation(film: Path) -> None:
-    """Mark a film as to be turned clockwise by a quarter for showing, as phones do that are held upright."""
-    data = bytearray(film.read_bytes())
-    header, _ = box(data, b"moov", b"trak", b"tkhd")
-    one = 0x10000
-    struct.pack_into(">9i", data, header + 8 + 40, 0, one, 0, -one, 0, 0, 0, 0, 0x40000000)
-    film.write_bytes(bytes(data))

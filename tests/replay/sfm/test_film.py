@@ -23,22 +23,6 @@ def card(shift: int = 0, size: tuple[int, int] = (96, 128)) -> UInt8:
     return np.ascontiguousarray(np.repeat(gray[:, :, None], 3, axis=2))
 
 
-def test_frames_have_the_times_of_a_film_with_a_variable_rate(tmp_path: Path) -> None:
-    path = films.write_film(tmp_path / "a.mp4", [card() for _ in range(4)])
-    units = films.set_frame_times(path, (512, 2048, 512, 1024))
-    stamps = [frame.stamp_ns for frame in Film(path)]
-    assert stamps == [round(1e9 * t / units) for t in (0, 512, 2560, 3072)]
-
-
-def test_a_film_that_is_marked_as_turned_comes_upright(tmp_path: Path) -> None:
-    path = films.write_film(tmp_path / "a.mp4", [card()] * 3)
-    films.set_rotation(path)
-    film = Film(path)
-    assert (film.width, film.height) == (96, 128)
-    frame = next(iter(film)).bgr
-    assert frame[:64, 48:].mean() > 240 > frame[:64, :48].mean()  # the white quarter went from upper left to the right
-
-
 def test_a_folder_of_pictures_is_a_film_in_the_order_of_its_numbers(tmp_path: Path) -> None:
     for number in (10, 9, 11):
         cv2.imwrite(str(tmp_path / f"IMG_{number}.jpg"), np.full((30, 40, 3), number, np.uint8))
