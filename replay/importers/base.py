@@ -201,12 +201,11 @@ def depth_of_points(points: Float64, intrinsics: CameraIntrinsics, reach: tuple[
 
     Each also fills the pixels beside it and above, as many as ``reach`` says of columns and rows.
     """
-    across, up = reach
-    k = intrinsics
+    (across, up), k = reach, intrinsics
     size = (k.width + 2 * across, k.height + 2 * up)
     around = CameraIntrinsics(k.fx, k.fy, k.cx + across, k.cy + up, *size)
     inside, rows, columns = nearest_pixels(points, around)
-    depth = np.full((around.height, around.width), np.inf, np.float32)
+    depth = np.full(size[::-1], np.inf, np.float32)
     np.minimum.at(depth, (rows[inside], columns[inside]), points[inside, 2].astype(np.float32))
     depth = np.asarray(cv2.erode(depth, np.ones((2 * up + 1, 2 * across + 1), np.uint8)))
     depth = depth[up : up + k.height, across : across + k.width]

@@ -69,16 +69,9 @@ def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
     places = find_models(folder)
     if not places:
         raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
-    models: dict[Path, ColmapModel] = {}
-    for place in places:
-        try:
-            models[place] = read_model(place)
-        except ImportSourceError as error:
-            if len(places) == 1:
-                raise
-            notices.append(f"a model is left out: {error}")
-    chosen = max(models, key=lambda place: len(models[place].images), default=None)
-    if chosen is None or not models[chosen].images:
+    models = dict(keep_good(lambda place: (place, read_model(place)), places, "model", notices))
+    chosen = max(models, key=lambda place: len(models[place].images), default=places[0])
+    if not models or not models[chosen].images:
         raise ImportSourceError("; ".join((f"{places[0]}: the model has no registered image", *notices)))
     if len(models) > 1:
         others = ", ".join(f"{p.name} of {len(m.images)}" for p, m in models.items() if p != chosen)

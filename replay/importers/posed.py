@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -111,7 +112,7 @@ class PosedPictures:
         self._read_rgb, self._read_depth, self._read_label = read_rgb, read_depth, read_label
         self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), hz, self.notices)
         self._factor = options.scale or 1.0
-        self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
+        self._rectifiers = lru_cache(KEPT_RECTIFIERS)(Rectifier)  # a picture may have a lens of its own
         metric = metric or options.scale is not None
         if not metric:
             self.notices.append(
@@ -197,14 +198,10 @@ class PosedPictures:
         return lens.nearest(depth_of_size(depth_m, (rgb.shape[0], rgb.shape[1]), file))
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
-        if intrinsics not in self._rectifiers:
-            if len(self._rectifiers) >= KEPT_RECTIFIERS:  # cameras with a lens a picture have as many as pictures
-                self._rectifiers.pop(next(iter(self._rectifiers)))
-            try:
-                self._rectifiers[intrinsics] = Rectifier(intrinsics)
-            except ConfigError as error:
-                raise BadFrameError(file, str(error)) from error
-        return self._rectifiers[intrinsics]
+        try:
+            return self._rectifiers(intrinsics)
+        except ConfigError as error:
+            raise BadFrameError(file, str(error)) from error
 
 
 def _at_size(picture: PosedPicture, size: tuple[int, int]) -> CameraIntrinsics:

@@ -29,7 +29,9 @@ from semantic_mapper.errors import CodecError, ConfigError, ImportSourceError, S
 from semantic_mapper.files import open_regular
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.importers.base import camera_of, metres
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.images import decode_image_file
+from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 _PACKED = (".zstd", ".zst")
 _MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}  # what the two kinds of files begin with
@@ -50,21 +52,16 @@ UNITS_PER_M = 1000.0  # of 16-bit depth
 # Encoding -> bytes a pixel, and what makes RGB of it; None = it is RGB.
 COLOR_ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
-    "bgr8": (3, cv2.COLOR_BGR2RGB),
-    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, cv2.COLOR_BGR2RGB)),
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, cv2.COLOR_BGRA2RGB),
-    "8UC4": (4, cv2.COLOR_BGRA2RGB),
-    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2RGB)),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2)),
     "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
     "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
-    "mono8": (1, cv2.COLOR_GRAY2RGB),
-    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    **dict.fromkeys(("mono8", "8UC1"), (1, cv2.COLOR_GRAY2RGB)),
 }
 DEPTH_ENCODINGS = {"16UC1": np.dtype("<u2"), "mono16": np.dtype("<u2"), "32FC1": np.dtype("<f4")}
 _MAX_SIDE = 1 << 14  # pixels
@@ -126,36 +123,28 @@ def _readable(src: Path) -> tuple[list[Path], tempfile.TemporaryDirectory[str]]:
 
 def _unpacked(file: Path, folder: Path) -> Path:
     path = (folder / file.stem).with_suffix(_packed_suffix(file))
-    try:
-        with file.open("rb") as packed, path.open("wb") as out:
-            zstandard.ZstdDecompressor().copy_stream(packed, out)
-    except (OSError, zstandard.ZstdError) as error:
-        raise ImportSourceError(f"{file}: cannot be unpacked: {error}; copy it again") from error
+    with file.open("rb") as packed, path.open("wb") as out:
+        zstandard.ZstdDecompressor().copy_stream(packed, out)
     return path
 
 
 def _with_profile(file: Path, folder: Path) -> Path:
     """The messages of a bag, written again with the profile that rosbags asks for."""
     path = folder / f"{file.stem}-ros2.mcap"
-    channels: dict[int, int] = {}
-    try:
-        with file.open("rb") as source, path.open("wb") as out:
-            writer = Writer(out)
-            writer.start(profile="ros2")
-            for schema, channel, message in make_reader(source).iter_messages():
-                if schema is None:
-                    continue
-                if channel.id not in channels:
-                    of = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    metadata = {"offered_qos_profiles": "", **channel.metadata}
-                    channels[channel.id] = writer.register_channel(
-                        channel.topic, channel.message_encoding, of, metadata
-                    )
-                written = channels[channel.id]
-                writer.add_message(written, message.log_time, message.data, message.publish_time, message.sequence)
-            writer.finish()
-    except (OSError, McapError, ValueError) as error:
-        raise ImportSourceError(f"{file}: cannot be read: {error}; `mcap recover` repairs what was cut off") from error
+    written: dict[int, int] = {}  # number of each channel
+    with file.open("rb") as source, path.open("wb") as out:
+        writer = Writer(out)
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            if schema is None:
+                continue
+            if channel.id not in written:
+                of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                metadata = {"offered_qos_profiles": "", **channel.metadata}
+                written[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of, metadata)
+            at = (message.log_time, message.data, message.publish_time, message.sequence)
+            writer.add_message(written[channel.id], *at)
+        writer.finish()
     return path
 
 
@@ -197,18 +186,19 @@ class Topic:
         return f"{self.name} ({visible(self.encoding)})"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A ``sensor_msgs/CameraInfo``."""
+    """A ``sensor_msgs/CameraInfo``: K (9,) and lens D of the raw image, P (12,) of the rectified one, R (3, 3)."""
 
-    frame: str  # of the camera
-    size: tuple[int, int]  # (width, height) of its images
-    model: str  # of the lens
-    K: Float64  # (9,) of the raw image
-    D: Float64  # coefficients of the lens
-    R: Float64  # (3, 3) by which rectification turns the image
-    P: Float64  # (12,) of the rectified image
-    whole: bool  # without binning, and without a region of interest
+    def __init__(self, info: Any) -> None:
+        self.frame = frame_name(info.header.frame_id)
+        self.size: tuple[int, int] = (info.width, info.height)
+        self.model: str = info.distortion_model
+        names = "KDRP" if hasattr(info, "K") else "kdrp"  # of ROS 1, and of ROS 2
+        self.K, self.D, R, self.P = (np.asarray(getattr(info, name), np.float64) for name in names)
+        self.R = R.reshape(3, 3)
+        roi = info.roi
+        cut = 0 < roi.width < info.width or 0 < roi.height < info.height or roi.x_offset or roi.y_offset
+        self.whole = not cut and info.binning_x <= 1 and info.binning_y <= 1
 
     @property
     def says_something(self) -> bool:
@@ -221,18 +211,16 @@ class Calibration:
         Raises ImportSourceError: not calibrated, a lens model that is not OpenCV's, skew, binning or a region of
         interest.
         """
-        if not self.whole:
-            raise ImportSourceError(f"{where} has binning or a region of interest, which is not read: record it whole")
         rectified = rectified and bool(self.P.any() or self.D.any())  # a pinhole camera's driver may leave P empty
         K = (self.P if rectified else self.K).reshape(3, -1)
-        if K[0, 1] or K[1, 0]:
-            raise ImportSourceError(f"{where} has skew, which is not undone: calibrate without it, and record again")
         k = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        if not k[0] or not k[1]:
-            matrix = "P" if rectified else "K"
-            raise ImportSourceError(
-                f"{where} is not calibrated ({matrix} is zero): calibrate the camera, and record again"
-            )
+        for trouble, there in (
+            ("binning or a region of interest", not self.whole),
+            ("skew", K[0, 1] or K[1, 0]),
+            (f"no calibration ({'P' if rectified else 'K'} is zero)", not k[0] or not k[1]),
+        ):
+            if there:
+                raise ImportSourceError(f"{where} has {trouble}: calibrate the camera, and record whole images again")
         return camera_of(where, k, self.size, "" if rectified else self.model, () if rectified else self.D.tolist())
 
 
@@ -243,12 +231,11 @@ class Bag:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
 
-        paths, self._unpacked = _readable(src)  # what was made for it is there as long as this is
         with self._explained():
+            paths, self._unpacked = _readable(src)  # what was made for it is there as long as this is
             # Bags of ROS 2 before Iron hold no definitions of their messages; those read here have not changed since.
             self._reader: Any = AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        self._is_ros2: bool = self._reader.is2
         self._streams: dict[str, tuple[int, Iterator[tuple[Any, int, bytes]]]] = {}  # next index, and its messages
 
     def topics(self, *types: str) -> list[str]:
@@ -279,7 +266,7 @@ class Bag:
         """Topic, time of recording, message, and its node (ROS 1; else empty), in the order of recording."""
         with self._explained():
             for connection, received_ns, data in self._reader.messages(connections=self._connections(names)):
-                node = "" if self._is_ros2 else connection.ext.callerid or ""
+                node = getattr(connection.ext, "callerid", None) or ""
                 yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype), node
 
     def message(self, name: str, received_ns: list[int], index: int) -> Any:
@@ -299,16 +286,6 @@ class Bag:
             raise CodecError(f"cannot be read: {error}") from error
         self._streams[name] = (index + 1, stream)
         return message
-
-    def calibration(self, info: Any) -> Calibration:
-        """A ``sensor_msgs/CameraInfo``, whose matrices are called differently in ROS 1 and 2."""
-        names = "kdrp" if self._is_ros2 else "KDRP"
-        K, D, R, P = (np.asarray(getattr(info, name), np.float64) for name in names)
-        roi, size = info.roi, (info.width, info.height)
-        cut = 0 < roi.width < info.width or 0 < roi.height < info.height or roi.x_offset or roi.y_offset
-        whole = not cut and info.binning_x <= 1 and info.binning_y <= 1
-        frame = frame_name(info.header.frame_id)
-        return Calibration(frame, size, info.distortion_model, K, D, R.reshape(3, 3), P, whole)
 
     def _connections(self, names: set[str]) -> list[Any]:
         return [c for c in self._reader.connections if c.topic in names]
@@ -339,8 +316,15 @@ def position_and_rotation(message: Any) -> tuple[Any, Any]:
     return pose.position, pose.orientation
 
 
-def color_image(message: Any) -> UInt8:
-    """RGB (H, W, 3) of a ``sensor_msgs/Image``.
+def compressed_image(message: Any) -> tuple[UInt8, EncodedImage]:
+    """RGB (H, W, 3) of a ``sensor_msgs/CompressedImage``, and its file. Raises CodecError: it is damaged."""
+    data = message.data.tobytes()
+    rgb, encoding = decode_image_file(data)
+    return rgb, EncodedImage(encoding, data)
+
+
+def color_image(message: Any) -> tuple[UInt8, None]:
+    """RGB (H, W, 3) of a ``sensor_msgs/Image``; no file has it.
 
     Raises CodecError: another encoding, or fewer bytes than its size needs.
     """
@@ -349,10 +333,8 @@ def color_image(message: Any) -> UInt8:
     bytes_a_pixel, code = COLOR_ENCODINGS[message.encoding]
     rows = _rows(message, bytes_a_pixel)
     pixels = rows.reshape(message.height, message.width, bytes_a_pixel)
-    if code is None:
-        return pixels
     try:
-        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+        return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code), np.uint8), None
     except cv2.error as error:
         raise CodecError(
             f"{message.encoding} of {message.width}x{message.height} is no image: {error.err or error}"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ from semantic_mapper.replay.importers.ros_bags import (
     Topic,
     color_image,
     compressed_depth_image,
+    compressed_image,
     depth_image,
     frame_name,
 )
@@ -52,8 +54,9 @@ from semantic_mapper.replay.importers.ros_transforms import (
 )
 from semantic_mapper.replay.importers.tum import match_nearest
 from semantic_mapper.transport.codec import EncodedImage
-from semantic_mapper.transport.images import decode_image_file
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, UInt8
+
+DecodedT = TypeVar("DecodedT")
 
 ROLES = ("image", "depth", "info", "depth_info", "pose")
 DEPTH_SCALE = DepthScale(UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
@@ -137,25 +140,19 @@ class _BagReader:
             read_depth=self._depth_m,
         )
 
-    def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
+    def _decoded(self, topic: Topic, file: Path, decode: Callable[[Any], DecodedT]) -> DecodedT:
         try:
-            message = self._bag.message(self._color.name, self._received[self._color.name], int(file.name))
-            if self._color.raw:
-                return color_image(message), None
-            data = message.data.tobytes()
-            rgb, encoding = decode_image_file(data)
-            return rgb, EncodedImage(encoding, data)
+            return decode(self._bag.message(topic.name, self._received[topic.name], int(file.name)))
         except CodecError as error:
             raise BadFrameError(file, str(error)) from error
 
+    def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
+        return self._decoded(self._color, file, color_image if self._color.raw else compressed_image)
+
     def _depth_m(self, picture: PosedPicture, lens: Rectifier) -> Float32:
         assert self._depth is not None and picture.depth_file is not None
-        try:
-            received_ns = self._received[self._depth.name]
-            message = self._bag.message(self._depth.name, received_ns, int(picture.depth_file.name))
-            depth_m = depth_image(message) if self._depth.raw else compressed_depth_image(message)
-        except CodecError as error:
-            raise BadFrameError(picture.depth_file, str(error)) from error
+        decode = depth_image if self._depth.raw else compressed_depth_image
+        depth_m = self._decoded(self._depth, picture.depth_file, decode)
         if self._registration is None:
             size = (lens.intrinsics.height, lens.intrinsics.width)
             return lens.nearest(depth_of_size(depth_m, size, picture.depth_file))
@@ -237,7 +234,7 @@ class _BagReader:
                 stamps[name].append(stamp_of(message.header))
                 self._received[name].append(received_ns)
             elif name in infos:
-                found, known = self._bag.calibration(message), self._calibrations[name]
+                found, known = Calibration(message), self._calibrations[name]
                 if found.says_something or not known:
                     known[:] = [*(old for old in known if old.says_something), found]
             elif name in transforms:

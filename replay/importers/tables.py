@@ -72,9 +72,8 @@ def keep_good(
 
 def without_picture(kind: str, numbers: Iterable[int], pictures: Iterable[int], where: Path) -> list[str]:
     """A sentence on poses or the like whose picture is missing; empty where all are there."""
-    missing = sorted({*numbers} - {*pictures})
-    what = f"{counted(len(missing), kind)} without a picture in {where}"
-    return [f"{what}; the first: number {missing[0]}"] if missing else []
+    missing = [f"number {number}" for number in sorted({*numbers} - {*pictures})]
+    return left_out_notice(kind, missing, f"without a picture in {where}")
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -156,12 +155,9 @@ def read_matrix(file: Path) -> Float64:
 
 
 def read_pose_rows(file: Path, pictures: Collection[int]) -> dict[int, Float64 | BadFrameError]:
-    """Poses (4, 4) of numbered pictures, by a file whose i-th row, 16 numbers row by row, belongs to picture i.
+    """Poses (4, 4) of numbered pictures, or why one is missing, by a file whose i-th row, 16 numbers, is of picture i.
 
     Raises ImportSourceError: missing, not text, or without a row.
-
-    Returns:
-        Of each picture and each row the pose, or why it is missing.
     """
     rows = read_rows(file, max(pictures, default=-1) + 1)
     if not rows:
@@ -196,13 +192,10 @@ def seconds_to_ns(text: str) -> int:
 
 
 def read_stamps(file: Path, count: int, hz: float, notices: list[str]) -> Sequence[int | BadFrameError]:
-    """Stamps of ``count`` images by a file whose i-th row belongs to image i; made up at ``hz`` where it is missing.
+    """Stamps (ns) of ``count`` images, or why one has none, by a file whose i-th row belongs to image i.
 
-    Rows hold nanoseconds, or all of them seconds (with a point), or date and time. Raises ImportSourceError: fewer rows
-    than images, or times that cannot be in nanoseconds.
-
-    Returns:
-        Of each image the stamp in nanoseconds, or why it has none.
+    Rows hold nanoseconds, or all of them seconds (with a point), or date and time. Without the file stamps are made up
+    at ``hz``. Raises ImportSourceError: fewer rows than images, or times that cannot be in nanoseconds.
     """
     if not file.exists():
         notices.append(f"no {file}: stamps are made up at {hz:g} frames a second")

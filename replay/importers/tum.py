@@ -100,10 +100,8 @@ def _read_list(file: Path, notices: list[str]) -> list[tuple[int, Path]]:
 def read_trajectory(file: Path) -> tuple[NDArray[np.int64], Float64, list[str]]:
     """Read lines ``stamp tx ty tz qx qy qz qw``, stamps in seconds.
 
-    Raises ImportSourceError: the file is missing or holds no pose.
-
-    Returns:
-        Stamps (N,) in nanoseconds, rising, rows (N, 7) tx ty tz qx qy qz qw, and why other lines are left out.
+    Gives stamps (N,) in nanoseconds, rising, rows (N, 7) tx ty tz qx qy qz qw, and why other lines are left out. Raises
+    ImportSourceError: the file is missing or holds no pose.
     """
     found: dict[int, list[float]] = {}
     left_out: list[str] = []
@@ -130,9 +128,7 @@ def read_trajectory(file: Path) -> tuple[NDArray[np.int64], Float64, list[str]]:
 def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: int) -> list[int]:
     """For each stamp of ``a`` the index of the nearest of ``b``, -1 = none; each of ``b`` goes to its nearest once.
 
-    Args:
-        a_ns, b_ns: (N,), (M,) rising.
-        within_ns: Largest difference.
+    Both are rising; ``within_ns`` is the largest difference.
     """
     if not len(b_ns):
         return [-1] * len(a_ns)
@@ -151,12 +147,8 @@ def pose_at(
 ) -> Float64 | None:
     """Pose (4, 4) at a time: position linear, rotation spherical; None where there are no poses round that time.
 
-    Args:
-        stamp_ns: When.
-        stamps_ns: (N,) rising.
-        rows: (N, 7) tx ty tz qx qy qz qw.
-        max_gap_ns: Longest between two poses over which is interpolated.
-        within_ns: How far before the first, after the last, or from one at a longer gap, the nearest still counts.
+    Stamps (N,) rise; rows (N, 7) are tx ty tz qx qy qz qw. Over gaps beyond ``max_gap_ns`` nothing is interpolated:
+    there, before the first and after the last pose, the nearest one within ``within_ns`` counts.
     """
     after = int(np.searchsorted(stamps_ns, stamp_ns))
     before = after - 1

@@ -39,12 +39,17 @@ def test_poses_of_transforms_json_change_axes_and_keep_their_unit(tmp_path: Path
         assert (frame.intrinsics.fx, frame.intrinsics.cx, frame.intrinsics.cy) == (F, 31.5, 23.5)
 
 
-@pytest.mark.parametrize("k1", [0.0, 0.3])
-def test_depth_of_transforms_json_is_read_and_makes_its_poses_metric(tmp_path: Path, k1: float) -> None:
-    report, frames = imported(rec.add_depth(rec.make_transforms(tmp_path / "nerf", k1=k1)))
+def test_depth_of_transforms_json_makes_its_poses_metric_and_has_a_unit_of_its_own(tmp_path: Path) -> None:
+    folder = rec.add_depth(rec.make_transforms(tmp_path / "nerf"))
+    report, frames = imported(folder)
     assert report.info.scale_known and report.with_depth == 3 and "stamps are made up" in report.notices[0]
     depth = frames[1].depth_m
     assert depth is not None and np.allclose(depth[H // 2 + 1 :], 1.501) and (depth[: H // 2 - 1] == 0).all()
+    report, frames = imported(folder, scale=2.0)
+    assert np.array_equal(frames[1].depth_m, depth) and "depth images keep their own unit" in said(report)
+    assert np.allclose(frames[2].T_world_camera[:3, 3], 2 * poses()[2][:3, 3])
+    with pytest.raises(ImportSourceError, match="in metres"):
+        imported(rec.make_record3d(tmp_path / "phone"), scale=2.0)
 
 
 def test_depth_follows_its_picture_when_the_lens_is_undone(tmp_path: Path) -> None:
@@ -58,15 +63,6 @@ def test_depth_follows_its_picture_when_the_lens_is_undone(tmp_path: Path) -> No
     white = frame.rgb[..., 0] > 127
     assert (white != (picture[..., 0] > 127)).sum() > 40  # the square has moved
     assert (white != (frame.depth_m < 2)).sum() < 30  # its depth with it, but for some of its edge
-
-
-def test_a_scale_makes_metres_of_poses_and_leaves_depth_alone(tmp_path: Path) -> None:
-    report, frames = imported(rec.add_depth(rec.make_transforms(tmp_path / "nerf")), scale=2.0)
-    assert frames[1].depth_m is not None and frames[1].depth_m.max() == pytest.approx(1.501)
-    assert np.allclose(frames[2].T_world_camera[:3, 3], 2 * poses()[2][:3, 3])
-    assert "depth images keep their own unit" in " ".join(report.notices)
-    with pytest.raises(ImportSourceError, match="in metres"):
-        imported(rec.make_record3d(tmp_path / "phone"), scale=2.0)
 
 
 def test_a_field_of_view_names_without_suffix_and_a_lens_are_understood(tmp_path: Path) -> None:
@@ -90,10 +86,7 @@ def test_a_colmap_model_is_imported_upright(tmp_path: Path, kind: str) -> None:
         assert np.allclose(T[:3, 1], (0, 0, -1), atol=1e-9)  # image down is down
         assert np.allclose(T[:3, 3] - moved[0][:3, 3], 2 * (true[:3, 3] - poses()[0][:3, 3]), atol=1e-9)
     assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (F, 31.5)
-
-
-def test_a_colmap_model_without_scale_says_so_and_is_made_of_room_size(tmp_path: Path) -> None:
-    report, frames = imported(rec.make_colmap(tmp_path / "scan", "bin"))
+    report, frames = imported(folder)  # without a scale it is made of room size
     assert not report.info.scale_known
     depths = [(POINTS - T[:3, 3]) @ T[:3, 2] for T in poses()]
     factor = 2.0 / np.median(depths)

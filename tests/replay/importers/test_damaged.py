@@ -35,7 +35,6 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
 }
 SPARSE = "sparse/0/"
 EYE = np.eye(4).tolist()
-REPLICA = "room_0/Sequence_1/"
 POSES = f"data_poses/{DRIVE}/cam0_to_world.txt"
 
 
@@ -59,10 +58,6 @@ def row(name: str, number: int, new: str) -> Edit:
         (folder / name).write_text("\n".join(rows) + "\n")
 
     return edit
-
-
-def cut(name: str, count: int) -> Edit:
-    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-count])
 
 
 def remove(*names: str) -> Edit:
@@ -149,12 +144,12 @@ STOPS: list[tuple[str, Edit, str]] = [
     ("colmap", text(SPARSE + "cameras.txt", "\n1 ", "\n2 "), "pycolmap ended"),
     ("colmap", row(SPARSE + "images.txt", 1, "1 x 0 0 0 0 0 0 1 0.png"), "pycolmap ended"),
     ("colmap", remove("images"), "pictures are missing"),
-    ("colmap.bin", cut(SPARSE + "images.bin", 5), "pycolmap ended"),
+    ("colmap.bin", lambda f: os.truncate(f / SPARSE / "images.bin", 200), "pycolmap ended"),
     ("record3d", keys("metadata.json", poses=[]), "holds no posed picture.*its pose is missing"),
     ("opensfm", model(lambda m: m.update(cameras={})), "camera 'v2 dji' is missing"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="spherical")), "'spherical' is not read"),
     ("opensfm", model(lambda m: m["cameras"]["v2 dji"].update(projection_type="fisheye", p1=0.1)), "p1 and p2"),
-    ("opensfm", cut("reconstruction.json", 100), "not valid JSON"),
+    ("opensfm", write("reconstruction.json", "[{"), "not valid JSON"),
 ]
 COSTS: list[tuple[str, Edit, int, str]] = [
     ("folder", remove("depth/000003.png"), 6, ""),
@@ -173,7 +168,7 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("tum", text("rgb.txt", "\n", "\r\n"), 6, ""),
     ("tum", text("groundtruth.txt", " ", "; "), 6, ""),
     ("folder", text("poses.txt", " ", ","), 6, ""),
-    ("scannet", remove("color/60.jpg"), 5, "1 pose without a picture"),
+    ("scannet", remove("color/60.jpg"), 5, "1 pose left out, without a picture"),
     ("replica", remove("depth/depth_1.png"), 3, ""),
     ("replica", row("traj_w_c.txt", 2, ""), 2, "row i belongs to image i"),
     ("replica", remove("../habitat/info_semantic.json"), 3, "info_semantic.json, which names its classes"),
@@ -188,10 +183,10 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("depth", remove("depths/1.png"), 3, "1 depth image left out, missing"),
     ("colmap", text(SPARSE + "images.txt", " 1.png", " ../1.png"), 2, "lies outside of it"),
     ("colmap", text(SPARSE + "images.txt", " 1.png", " " + "a" * 300 + "1.png"), 2, "without a pose in this model"),
-    ("polycam", remove("keyframes/corrected_images/5000000.jpg"), 2, "1 camera without a picture"),
+    ("polycam", remove("keyframes/corrected_images/5000000.jpg"), 2, "1 camera left out, without a picture"),
     ("record3d", keys("metadata.json", fps=0), 3, "made up at 60"),
     ("record3d", keys("metadata.json", perFrameIntrinsicCoeffs=[[50.0, "x", 32.0, 24.0], None, 3]), 3, ""),
-    ("record3d", lambda f: (f / "rgb/1.jpg").rename(f / "rgb/7.jpg"), 2, "1 pose without a picture"),
+    ("record3d", lambda f: (f / "rgb/1.jpg").rename(f / "rgb/7.jpg"), 2, "1 pose left out, without a picture"),
     ("opensfm", shot(translation=[0, 0, None]), 3, "translation"),
     ("opensfm", shot(camera="another"), 3, "camera 'another'"),
     ("opensfm", shot("../a.jpg"), 3, "outside"),

@@ -236,10 +236,9 @@ def test_tum_calibrations_go_by_the_name_of_the_sequence(tmp_path: Path) -> None
     ):
         src = rec.make_tum(tmp_path / name, count=2)
         (src / "intrinsics.json").unlink()
-        for file in (src / "rgb").iterdir():
-            rec.write_image(file, rec.color(0, 640, 480))
-        for file in (src / "depth").iterdir():
-            rec.write_image(file, np.full((480, 640), 5000, np.uint16))
+        for kind, image in (("rgb", rec.color(0, 640, 480)), ("depth", np.full((480, 640), 5000, np.uint16))):
+            for file in (src / kind).iterdir():
+                rec.write_image(file, image)
         report, _ = imported(src)
         assert report.info.cameras["camera"].fx == pytest.approx(fx, abs=1e-3)
         assert notice in " ".join(report.notices)
@@ -303,19 +302,15 @@ def test_raw_scannet_ids_need_the_table_of_the_data_set(scannet: Path) -> None:
     assert np.array_equal(frames[0].label, np.where(rec.label(0) == 5, 40, rec.label(0)))
 
 
-def test_classes_are_renamed_and_joined_on_the_way_in(folder: Path) -> None:
-    report, frames = imported(folder, renames={"floor": "ground", "chair": "ground"})
+def test_classes_are_renamed_and_joined_and_images_turned_on_the_way_in(folder: Path) -> None:
+    plain = imported(folder)[1]
+    report, frames = imported(folder, renames={"floor": "ground", "chair": "ground"}, quarters=1)
     labels = report.info.label_set
-    assert report.labelled == 6 and labels is not None
-    assert dict(zip(labels.names, labels.ids, strict=True)) == {"wall": 1, "ground": 2}
+    assert report.labelled == 6 and labels is not None and (labels.names, labels.ids) == (("wall", "ground"), (1, 2))
     for i, frame in enumerate(frames):
-        assert np.array_equal(frame.label, np.where(rec.label(i) == 5, 2, rec.label(i)))
-
-
-def test_images_of_a_camera_on_its_side_are_turned(folder: Path) -> None:
-    plain, turned = imported(folder)[1][1], imported(folder, quarters=1)[1][1]
-    assert np.array_equal(turned.rgb, np.rot90(plain.rgb, -1)) and turned.intrinsics.width == rec.HEIGHT
-    np.testing.assert_allclose(turned.T_world_camera[:3, 1], plain.T_world_camera[:3, 0])
+        assert np.array_equal(frame.label, np.rot90(np.where(rec.label(i) == 5, 2, rec.label(i)), -1))
+        assert np.array_equal(frame.rgb, np.rot90(plain[i].rgb, -1)) and frame.intrinsics.width == rec.HEIGHT
+        np.testing.assert_allclose(frame.T_world_camera[:3, 1], plain[i].T_world_camera[:3, 0])
 
 
 def test_a_replica_sequence_is_imported_without_loss(tmp_path: Path) -> None:
