@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib
-import sys
-from pathlib import Path
 from typing import Any
 
 from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.base import as_camera_error
 from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.errors import DependencyError
-from semantic_mapper.mapping.open3d_loader import preload_folder, preload_libusb
+from semantic_mapper.mapping.open3d_loader import preload_libraries
 
 UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="8086", MODE="0666"'
 _FIX = (
@@ -25,7 +23,7 @@ _FIX = (
 @functools.cache
 def load_realsense() -> Any:
     """Import ``pyrealsense2`` once and return the module; ``DependencyError`` where it cannot be loaded."""
-    notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")  # the wheel links libusb, and has none
+    notes = preload_libraries()  # the wheel links libusb, and has none
     try:
         return importlib.import_module("pyrealsense2")
     except (ImportError, OSError) as error:

@@ -20,8 +20,7 @@ _log = get_logger(__name__)
 @functools.cache
 def load_open3d() -> Any:
     """Import Open3D once and return the module, quiet; ``DependencyError`` says which library is missing."""
-    folder = Path(sys.prefix) / "syslibs"
-    notes = _preload(_libusb() + sorted(p for p in folder.rglob("*.so*") if p.is_file()))
+    notes = preload_libraries()
     try:
         open3d = importlib.import_module("open3d")
     except (ImportError, OSError, MemoryError) as error:
@@ -37,8 +36,11 @@ def load_open3d() -> Any:
     return open3d
 
 
-def _preload(waiting: list[Path]) -> list[str]:
-    """Load shared libraries into the process, in whatever order their links ask for; a line for each that is not."""
+def preload_libraries() -> list[str]:
+    """Load libusb and what ``make setup`` has put into ``syslibs`` into the process, in whatever order their links ask
+    for; a line for each that cannot be loaded."""
+    folder = Path(sys.prefix) / "syslibs"
+    waiting = _libusb() + sorted(p for p in folder.rglob("*.so*") if p.is_file())
     failures: dict[Path, str] = {}
     while waiting:
         failures = {}
