@@ -66,7 +66,7 @@ def _plain(model: str) -> str:
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
     """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees.
 
-    ``FrameError`` where there is none.
+    ``FrameError`` where none fits.
     """
     distance = _THETAS * (1 + np.polynomial.polynomial.polyval(_THETAS**2, (0.0, *lens.distortion)))
     rising = int(np.argmax(np.diff(distance, append=-1.0) <= 0)) + 1  # beyond its fold a polynomial means nothing

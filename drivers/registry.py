@@ -67,7 +67,7 @@ def find_cameras(kinds: Sequence[str] = KINDS) -> tuple[list[FoundCamera], dict[
 def find_device(search: Callable[[], Mapping[str, Any]], kind: str, address: str, fix: str) -> Any:
     """The only device that ``search`` finds by name, looked for until it is there.
 
-    Raises CameraError: there is none of this address (empty: of any), or several.
+    Raises CameraError: no device of this address (empty: of any), or several.
     """
     deadline = time.monotonic() + SEARCH_S
     while not (found := search()) and time.monotonic() < deadline:

@@ -51,7 +51,7 @@ def list_devices() -> list[FoundCamera]:
 def find_device(address: str) -> Any:
     """DepthAI's ``DeviceInfo`` by id, IP address or USB path; empty for the only one that is connected and free.
 
-    Raises CameraError: there is none, or several.
+    Raises CameraError: no camera, or several.
     """
 
     def free() -> dict[str, Any]:

@@ -48,7 +48,7 @@ def list_devices() -> list[FoundCamera]:
 def find_device(serial: str) -> Any:
     """The SDK's ``device`` of a serial number; empty for the only one that is connected.
 
-    Raises CameraError: there is none, or several.
+    Raises CameraError: no camera, or several.
     """
 
     def fitting() -> dict[str, Any]:

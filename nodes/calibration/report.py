@@ -117,9 +117,9 @@ def as_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: lis
     return {"cameras": cameras, "rig": rig, "files": [str(path) for path in files]}
 
 
-def tables(told: dict[str, Any]) -> Iterator[Table]:
+def tables(plain: dict[str, Any]) -> Iterator[Table]:
     """What ``as_json`` tells, for people."""
-    for name, camera in told["cameras"].items():
+    for name, camera in plain["cameras"].items():
         width, height = camera["size"]
         table = Table(title=f"{name}, {width} x {height}", title_justify="left", show_header=False)
         table.add_column()
@@ -139,11 +139,11 @@ def tables(told: dict[str, Any]) -> Iterator[Table]:
         up, side = camera["leaned_deg"]
         table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
         yield table
-    if told["rig"] is not None:
-        caption = f"{told['rig']['rms_px']:.3f} px RMS of all corners at once"
+    if plain["rig"] is not None:
+        caption = f"{plain['rig']['rms_px']:.3f} px RMS of all corners at once"
         titles = ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg")
         table = Table(*titles, title="rig", title_justify="left", caption=caption)
-        for name, place in told["rig"]["cameras"].items():
+        for name, place in plain["rig"]["cameras"].items():
             T = np.array(place["T_rig_camera"])
             position = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
             turned = np.degrees(np.linalg.norm(rotation_vector(T)))

@@ -71,10 +71,10 @@ def calibrate(
             files = report.write_stereo(out, places[0].name, found, settings)
         else:
             files = report.write_files(out, found, settings)
-    told = report.as_json(found, gathered.cameras, files)
-    for part in (*report.tables(told), *files):
+    plain = report.as_json(found, gathered.cameras, files)
+    for part in (*report.tables(plain), *files):
         output.print(part)
-    output.json(told)
+    output.json(plain)
 
 
 def board_settings(path: Path | None, square_mm: float) -> CalibrationSettings:

@@ -101,8 +101,8 @@ def query(
         code = 0 if located and all(located) else EXIT_FAILED
     else:
         client = MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(open_saved(source))
-        with client as asked:
-            found = {"map": source, **answer(asked, question, name, point, up, min_confidence, gone, picture)}
+        with client as world_map:
+            found = {"map": source, **answer(world_map, question, name, point, up, min_confidence, gone, picture)}
         output.print(answer_table(found))
     if out is not None:
         write_json(out, found)
@@ -117,7 +117,7 @@ def open_saved(source: str) -> MapSnapshot:
 
 
 def answer(
-    asked: MapClient | MapSnapshot,
+    world_map: MapClient | MapSnapshot,
     question: Question,
     class_name: str = "",
     point: tuple[float, ...] = (),
@@ -129,23 +129,25 @@ def answer(
     """The answer of a running mapper or of a saved map, as plain data; the arguments are those of ``query``."""
     match question:
         case "info":
-            return map_answers.describe_map(asked if isinstance(asked, MapSnapshot) else asked.mirror().snapshot())
+            return map_answers.describe_map(
+                world_map if isinstance(world_map, MapSnapshot) else world_map.mirror().snapshot()
+            )
         case "at":
-            is_saved = isinstance(asked, MapSnapshot)
-            labels = (asked if is_saved else asked.info()).label_set
-            found = at(asked, [point]) if is_saved else asked.at([point])
+            is_saved = isinstance(world_map, MapSnapshot)
+            labels = (world_map if is_saved else world_map.info()).label_set
+            found = at(world_map, [point]) if is_saved else world_map.at([point])
             return map_answers.answer_at(labels, point, found)
         case "nearest":
             what = (class_name, point, min_confidence)
-            hit = nearest(asked, *what) if isinstance(asked, MapSnapshot) else asked.nearest(*what)
+            hit = nearest(world_map, *what) if isinstance(world_map, MapSnapshot) else world_map.nearest(*what)
             return map_answers.answer_nearest(class_name, point, hit)
         case "instances":
-            axis = up or (_up_in(asked) if isinstance(asked, MapSnapshot) else map_answers.UP)
-            if isinstance(asked, MapSnapshot):
-                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(asked))
-            return map_answers.answer_instances(axis, asked.instances(axis, gone=gone))
+            axis = up or (_up_in(world_map) if isinstance(world_map, MapSnapshot) else map_answers.UP)
+            if isinstance(world_map, MapSnapshot):
+                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(world_map))
+            return map_answers.answer_instances(axis, world_map.instances(axis, gone=gone))
         case _:  # the graph
-            graph = GraphTracker(up).update(asked) if isinstance(asked, MapSnapshot) else asked.graph(up)
+            graph = GraphTracker(up).update(world_map) if isinstance(world_map, MapSnapshot) else world_map.graph(up)
             if picture is not None:
                 if not graph.floors:
                     raise MapError(f"there is nothing to draw: {map_answers.NO_FLOOR}")

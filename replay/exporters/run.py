@@ -118,7 +118,7 @@ def _choose_camera(log: Log, camera: str, name: LogFormat) -> str:
         return ""
     there = sorted({envelope.source for envelope, _ in log.frame_parts()})
     if camera not in there if camera else len(there) > 1:
-        raise ConfigError(f"{name}: name one camera of the log with --camera: {', '.join(there) or 'there is none'}")
+        raise ConfigError(f"{name}: name one camera of the log with --camera: {', '.join(there) or 'it has no camera'}")
     return camera
 
 

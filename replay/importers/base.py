@@ -199,7 +199,7 @@ def metres(values: NDArray[np.generic], units_per_m: float) -> Float32:
 def depth_of_points(points: Float64, intrinsics: CameraIntrinsics, reach: tuple[int, int] = (0, 0)) -> Float32:
     """Depth (H, W) in metres that points (N, 3) of the camera's frame give it, 0 where none falls; the nearest wins.
 
-    Each also fills the pixels beside it and above, as many as ``reach`` says of columns and rows.
+    Each also fills its neighbours within ``reach`` columns and rows.
     """
     (across, up), k = reach, intrinsics
     size = (k.width + 2 * across, k.height + 2 * up)

@@ -385,8 +385,8 @@ class _BagReader:
         """The frame of tf in which poses are."""
         way = self._tree.way_up(self._frame)
         wanted = frame_name(self._options.world)
-        worlds = (wanted,) if wanted else WORLD_FRAMES
-        world = next((world for world in worlds if world in way), None)
+        frames = (wanted,) if wanted else WORLD_FRAMES
+        world = next((world for world in frames if world in way), None)
         if world is not None:
             return world
         if len(way) == 1:
@@ -396,7 +396,7 @@ class _BagReader:
             )
         still = "" if self._tree.moving_above(self._frame, way[-1]) else ", where the camera stood still"
         raise ImportSourceError(
-            f"tf has no frame {', '.join(worlds)} above the camera: {' on '.join(map(repr, way))}; record tf or "
+            f"tf has no frame {', '.join(frames)} above the camera: {' on '.join(map(repr, way))}; record tf or "
             f"odometry, or name a topic of poses (--topic pose=NAME), or the world{still}: --world {way[-1]}"
         )
 

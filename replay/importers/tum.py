@@ -147,8 +147,9 @@ def pose_at(
 ) -> Float64 | None:
     """Pose (4, 4) at a time: position linear, rotation spherical; None where there are no poses round that time.
 
-    Stamps (N,) rise; rows (N, 7) are tx ty tz qx qy qz qw. Over gaps beyond ``max_gap_ns`` nothing is interpolated:
-    there, before the first and after the last pose, the nearest one within ``within_ns`` counts.
+    Stamps (N,) rise; rows (N, 7) are tx ty tz qx qy qz qw. Nothing is interpolated
+    between two that are more than ``max_gap_ns`` apart: there, before the first and after the last pose, the nearest
+    one within ``within_ns`` counts.
     """
     after = int(np.searchsorted(stamps_ns, stamp_ns))
     before = after - 1

@@ -117,7 +117,7 @@ def finetune(
         start: Weights to start from, adapted to ``label_set`` by class name; None = random. Kinds that hold one scene
             take its config and its box alone, "panoptic" also its boxes.
         config: At least one of ``seconds`` and ``steps`` set.
-        stopped: Asked before every step; once it returns anything true, the best weights so far are the result.
+        stopped: Called before every step; once it returns anything true, the best weights so far are the result.
         seen_stamps_ns: Frames that ``start`` was fitted to; the result remembers them with its own.
         kind: Of the field; None = that of ``start``, or S-Ray.
 

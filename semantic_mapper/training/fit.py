@@ -65,7 +65,7 @@ class Budget:
     """How long a fit may take, who follows it, and who may end it; it begins now.
 
     Wall-clock ``seconds`` include the last look at held-out rays; 0 = only ``steps`` count, and the other way round.
-    ``looks``: over the whole budget. ``stopped``: asked before every step; once it returns something true, the fit
+    ``looks``: over the whole budget. ``stopped``: called before every step; once it returns something true, the fit
     ends. Raises ConfigError: neither seconds nor steps.
     """
 

@@ -534,7 +534,7 @@ class QuerySocket(Closing):
 
     Where no answer comes in time the socket is thrown away and the question sent again through a new one, so that a
     server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
-    does carries an id, and a server that has seen it only answers. It is asked ``attempts`` times and given
+    does carries an id, and a server that has seen it only answers. It gets the question ``attempts`` times and given
     ``timeout_s`` for each answer. Raises TransportError: see ``client_socket``.
     """
 
