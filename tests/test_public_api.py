@@ -43,3 +43,9 @@ def test_script_beside_modules_of_the_same_names_gets_both(tmp_path: Path) -> No
         "semantic_mapper.mapper",
         "semantic_mapper.replay.log.sequence",
     ]
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    program = "import semantic_mapper, sys; print(sorted({'torch', 'numpy', 'zmq', 'open3d'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr

@@ -27,7 +27,7 @@ from semantic_mapper.mapping.frame_depth import (
     computed_trust,
     rendered_trust,
 )
-from semantic_mapper.mapping.fusion import COMPUTED_CAP, MEASURED
+from semantic_mapper.mapping.fusion import COMPUTED_CAP, COMPUTED_LOOK, MEASURED, SURFACE_WEIGHT
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.rendered_views import frame as posed
@@ -174,3 +174,36 @@ def test_one_measurement_outweighs_all_that_was_computed_and_is_then_left_alone(
     assert old.any()
     for name in ("tsdf", "weight", "color"):
         assert before[name][old].tobytes() == after[name][old].tobytes(), name
+
+
+def test_computed_depth_adds_to_a_measured_map_and_leaves_it_as_it_is() -> None:
+    half = len(walk()) // 2
+    pipeline = mapped(walk()[:half])
+    before = pipeline.voxel_map.block_state()
+    for frame in without_depth(walk()[half:]):
+        pipeline.step(frame)
+    after = pipeline.voxel_map.block_state()
+    rows = {tuple(key): row for row, key in enumerate(after["keys"].tolist())}
+    here = [rows[tuple(key)] for key in before["keys"].tolist()]
+    measured = before["weight"] >= MEASURED
+    assert measured.sum() > 10_000
+    for name in ("tsdf", "weight", "color"):
+        assert after[name][here][measured].tobytes() == before[name][measured].tobytes(), name
+    new = (after["weight"] > 0) & (after["weight"] < MEASURED)
+    assert new.any(), "what the first half has not seen is computed"
+    said = pipeline.voxel_map.points().measured
+    assert said is not None and 0.1 < said.mean() < 1
+    view = pipeline.voxel_map.ray_cast(walk()[0].T_world_camera, CAMERA)
+    assert view.measured is not None and view.measured[view.depth_m > 0].mean() > 0.9
+
+
+def test_any_number_of_computed_looks_weighs_less_than_one_measurement() -> None:
+    depth = slanted()
+    voxel_map = small_map()
+    for seq in range(40):
+        voxel_map.integrate(posed(seq=seq), depth, None, trust=np.full_like(depth, MOST_TRUST), measured=False)
+        if seq < 2:
+            assert voxel_map.block_state()["weight"].max() == (seq + 1) * COMPUTED_LOOK
+            assert bool(len(voxel_map.points().xyz)) == ((seq + 1) * COMPUTED_LOOK >= SURFACE_WEIGHT)
+    assert voxel_map.block_state()["weight"].max() == COMPUTED_CAP < MEASURED
+    assert not voxel_map.points().measured.any()

@@ -148,3 +148,11 @@ def test_a_full_disk_costs_no_block_and_mapping_goes_on_once_there_is_room() -> 
         walk(voxel_map, 2, first=station)
         walk(voxel_map, 2)
     assert same(free.block_state(), paged.block_state())
+
+
+def test_a_frame_past_the_limit_on_blocks_is_refused_before_a_part_of_it_is_fused() -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=1, max_blocks=WIDE + 10)
+    pose = along_the_wall(0.0)
+    with pytest.raises(MapError, match="the map is full: 0 blocks"):
+        voxel_map.integrate(frame(pose), plane_depth(pose, (0.0, 0.0, 1.0), 1.0), sure(0), None)
+    assert voxel_map.block_count == voxel_map.frames == voxel_map.version == 0

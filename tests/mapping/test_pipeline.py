@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import GridFieldConfig
-from semantic_mapper.errors import PoseError, WeightsError
+from semantic_mapper.errors import FrameError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.streaming import StreamingSRay
@@ -209,3 +209,19 @@ def test_what_does_not_fit_the_pipeline_is_refused() -> None:
         FieldTrial(pipeline, StreamingSRay(tiny_field(NYU40)), (), ())
     with pytest.raises(WeightsError, match="65 keyframes come with these weights, but only 64 are kept"):
         FieldTrial(pipeline, StreamingSRay(tiny_field()), [FRAMES[0]] * 65, ())
+
+
+def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+):
+    monkeypatch.setattr("semantic_mapper.mapping.allocation.LEAST_FRAME_BUDGET", 400)
+    a, b = (make_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
+    good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
+    noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))
+    a.step(good)
+    with pytest.raises(FrameError, match=r"more than 400 blocks of 0\.02 m voxels"):
+        a.step(noise)
+    a.step(replace(good, seq=2))
+    b.step(good)
+    b.step(replace(good, seq=2))
+    assert same_map(a, b)

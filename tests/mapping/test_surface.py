@@ -183,3 +183,13 @@ def test_points_beyond_all_numbers_do_no_harm_and_unknown_ones_are_unknown(rng: 
     for points in (np.full((2, 3), 300.0), wild[:0]):
         read = read_points(points, index, buffers, 0.5, 0.0)
         assert (read.channel == -1).all() and not (read.rgb.any() or read.confidence.any() or read.measured.any())
+
+
+def test_depth_edge_is_not_bridged_by_a_false_surface() -> None:
+    depth = plane_depth(np.eye(4), (0, 0, 1), 1.5)
+    depth[:, :80] = 1.0  # a wall in front of a wall
+    voxel_map = small_map()
+    voxel_map.integrate(frame(), depth, None, None)
+    z = voxel_map.points().xyz[:, 2]
+    between = (z > 1.02) & (z < 1.48)
+    assert between.mean() < 0.005

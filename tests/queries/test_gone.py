@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semantic_mapper.client import MapClient
 from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import surface_points, surface_voxels
 from tests.mapping.rendered_views import INTRINSICS, frame, small_map
+from tests.nodes.mapper.test_query_service import answering
 from tests.queries.scene import CUP, FLOOR, LABELS, TABLE
 
 WALL_M, THING_M = 1.5, 1.0
@@ -114,3 +117,36 @@ def test_changes_say_which_blocks_lost_surface_and_when() -> None:
     for mine, theirs in zip(follower.snapshot().cleared, rows, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert len(follower.apply(dataclasses.replace(changes, since=0)).cleared.packed) == len(rows.packed)  # not twice
+
+
+def thing_points(snapshot: MapSnapshot) -> int:
+    xyz = surface_points(snapshot, surface_voxels(snapshot)).xyz
+    return int((np.abs(xyz[:, 2] - THING_M) < 0.1).sum())
+
+
+def test_a_client_gets_what_is_gone_and_its_mirror_keeps_no_ghost(tmp_path_factory: pytest.TempPathFactory) -> None:
+    stage, folder = Stage(), tmp_path_factory.mktemp("q")
+
+    def answered(client: MapClient, *, gone: bool) -> tuple[Instance, ...]:
+        things = client.instances(gone=gone)
+        while client.version < stage.map.version:  # an answer may be about the map of a moment ago
+            things = client.instances(gone=gone)
+        while client.mirror().version < stage.map.version:
+            pass
+        return things
+
+    with (
+        answering(f"ipc://{folder / 'q'}", stage.map) as service,
+        MapClient(service.endpoint, timeout_s=60) as client,
+    ):
+        stage.show(WHOLE, times=10)
+        (table,) = answered(client, gone=True)
+        assert table.gone_ns is None and thing_points(client.mirror().snapshot()) > 100
+        stage.show(None, times=2)
+        third = stage.show(None)
+        stage.show(None)
+        assert answered(client, gone=False) == ()
+        (gone,) = answered(client, gone=True)
+        assert (gone.id, gone.gone_ns) == (table.id, third)
+        np.testing.assert_array_equal(gone.voxels, table.voxels)
+        assert thing_points(client.mirror().snapshot()) == thing_points(MapMirror.of(stage.map).snapshot()) == 0

@@ -1,12 +1,14 @@
-"""Stores in folders and elsewhere: one result counts, whole or not at all."""
+"""Stores in folders and buckets: one result counts, whole or not at all."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import fsspec
 import pytest
+from fsspec.config import conf, set_conf_env
+from moto.server import ThreadedMotoServer
 
 from semantic_mapper.errors import ConfigError, StoreError
 from semantic_mapper.nodes.fleet.results import Tables
@@ -15,11 +17,35 @@ from tests.nodes.fleet.made_up import failure_of, made_up, store_of
 
 RESULT = made_up(1)
 OTHER = made_up(1, folder=f"files/{RESULT.key}/two")
+BUCKET = "s3://results/fleet"
 
 
-@pytest.fixture(params=["folder", "memory"])
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """URL for a store in an empty bucket."""
+    moto = ThreadedMotoServer(port=0)
+    moto.start()
+    host, port = moto.get_host_and_port()
+    for name, value in (
+        ("AWS_ACCESS_KEY_ID", "name"),
+        ("AWS_SECRET_ACCESS_KEY", "secret-of-the-test"),
+        ("FSSPEC_S3_ENDPOINT_URL", f"http://{host}:{port}"),
+    ):
+        monkeypatch.setenv(name, value)
+    set_conf_env(conf)
+    files = fsspec.get_filesystem_class("s3")
+    files.clear_instance_cache()
+    fsspec.filesystem("s3").mkdir("results")
+    yield BUCKET
+    fsspec.filesystem("s3").rm("results", recursive=True)
+    moto.stop()
+    conf.pop("s3", None)
+    files.clear_instance_cache()
+
+
+@pytest.fixture(params=["folder", "bucket"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return f"memory://{uuid4()}/fleet" if request.param == "memory" else str(tmp_path / "a b [1]*? ü")
+    return request.getfixturevalue("bucket") if request.param == "bucket" else str(tmp_path / "a b [1]*? ü")
 
 
 def test_results_failures_and_files_come_back_and_the_first_commit_counts(url: str, tmp_path: Path) -> None:
@@ -41,18 +67,21 @@ def test_results_failures_and_files_come_back_and_the_first_commit_counts(url: s
     assert Tables(again).query("count(*)").values == [(2,)]
 
 
-def test_a_manifest_and_globs_are_read_from_elsewhere() -> None:
-    files, place = fsspec.filesystem("memory"), str(uuid4())
-    files.pipe_file(f"/{place}/fleet.csv", b"log,robot\nsite/a.mcap,r1\n")
+def test_a_manifest_and_globs_are_read_from_a_bucket(bucket: str) -> None:
+    files = fsspec.filesystem("s3")
+    files.pipe_file("results/fleet.csv", b"log,robot\nsite/a.mcap,r1\n")
     for name in "ab":
-        files.pipe_file(f"/{place}/site/{name}.mcap", b"a")
-    (tagged,) = find_inputs([f"memory://{place}/fleet.csv"], ".mcap")
-    assert (tagged.url, tagged.tags) == (f"memory://{place}/site/a.mcap", {"robot": "r1"})
-    found = find_inputs([f"memory://{place}/site/*.mcap"], ".mcap")
-    assert [item.url.removeprefix(f"memory:///{place}/") for item in found] == ["site/a.mcap", "site/b.mcap"]
+        files.pipe_file(f"results/site/{name}.mcap", b"a")
+    (tagged,) = find_inputs(["s3://results/fleet.csv"], ".mcap")
+    assert (tagged.url, tagged.tags) == ("s3://results/site/a.mcap", {"robot": "r1"})
+    found = find_inputs(["s3://results/site/*.mcap"], ".mcap")
+    assert [item.url for item in found] == ["s3://results/site/a.mcap", "s3://results/site/b.mcap"]
+    with pytest.raises(StoreError, match="s3://no-such-bucket/fleet") as caught:
+        Store("s3://no-such-bucket/fleet", create=True)
+    assert "secret-of-the-test" not in str(caught.value)
 
 
-def test_a_store_is_found_from_elsewhere_and_names_damaged_results(
+def test_a_store_of_a_relative_path_is_found_from_elsewhere_and_names_a_damaged_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
