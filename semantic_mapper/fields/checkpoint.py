@@ -186,7 +186,9 @@ def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path)
 def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
     Raises WeightsError: missing, damaged, of another format or version, or its base is."""
-    if not path.is_file():
+    if path.exists() and not path.is_file():
+        raise WeightsError(f"{path}: is no regular file; copy its content to one")
+    if not path.exists():
         raise WeightsError(
             f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine "
             f"maps `semantic-mapper-research train --kind {MAP_KIND}`)"
