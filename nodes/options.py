@@ -9,7 +9,7 @@ import msgspec
 
 from semantic_mapper.config import Config, Positive, read_toml
 
-SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
+SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/messages.py, which loads what the launcher has no need of
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
 CAMERA_KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd", "visual")

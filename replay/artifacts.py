@@ -164,7 +164,7 @@ def _nearly_empty(session: MapSession, points: int) -> str | None:
 
 def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
     """The summary as plain data."""
-    pipeline, bundle = session.pipeline, session.bundle
+    pipeline, mapper = session.pipeline, session.mapper
     voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
     refusals = sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)
     return {
@@ -221,15 +221,15 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "scored_classes": list(session.truth.shared) if session.truth is not None else None,
         },
         "field": {
-            "name": bundle.checkpoint.model.kind,
+            "name": mapper.checkpoint.model.kind,
             "renderer": type(pipeline.field).__name__,
             "sampling": pipeline.config.sampling.mode,
-            "anchors": len(bundle.checkpoint.anchors),
+            "anchors": len(mapper.checkpoint.anchors),
         },
         "weights": {
-            "file": bundle.weights_path.name,
-            "recipe": bundle.checkpoint.recipe.get("kind", "unknown"),
-            "finetuned_frames": len(bundle.checkpoint.train_stamps_ns),
+            "file": mapper.weights_path.name,
+            "recipe": mapper.checkpoint.recipe.get("kind", "unknown"),
+            "finetuned_frames": len(mapper.checkpoint.train_stamps_ns),
             "learned": session.learned,
         },
         "seed": pipeline.config.seed,

@@ -94,13 +94,13 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
             there += [folder] if folder.exists() else []
         if there:
             raise LogError(f"{there[0]}: exists already; remove it or choose another name")
-        bundle = _load(request, log)
-        label_set = _label_set(log, bundle.label_set, request)
-        bundle.voxel_map.note_scale(log.info.scale_known)
+        mapper = _load(request, log)
+        label_set = _label_set(log, mapper.label_set, request)
+        mapper.voxel_map.note_scale(log.info.scale_known)
         if folder is not None:
             prepare_folder(folder.parent)
             things = stack.enter_context(atomic_folder(folder, raises=LogError))
-        labeller = _Labeller(bundle, label_set, request, things)
+        labeller = _Labeller(mapper, label_set, request, things)
         settings = f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
         name = hashlib.sha256(f"{labeller.digest} {settings}".encode()).hexdigest()[:8]
         monitor.start(min(len(log), request.max_frames or len(log)))
@@ -132,20 +132,20 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 
 def _load(request: AutolabelRequest, log: Log) -> Mapper:
     """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame."""
-    bundle = Mapper.load(request.weights, request.config)
-    model = bundle.checkpoint.model
-    if not model.knows_classes or len(bundle.label_set) < 2:
+    mapper = Mapper.load(request.weights, request.config)
+    model = mapper.checkpoint.model
+    if not model.knows_classes or len(mapper.label_set) < 2:
         raise WeightsError(
-            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can "
+            f"{mapper.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can "
             "label nothing; give weights that were trained on labels"
         )
     if request.instances is not None and not isinstance(model, Panoptic):
         raise WeightsError(
-            f"{bundle.weights_path}: a field of kind '{model.kind}' has no boxes, so that it tells no things apart; "
+            f"{mapper.weights_path}: a field of kind '{model.kind}' has no boxes, so that it tells no things apart; "
             "--instances goes with weights of `finetune --kind panoptic`"
         )
     if not model.holds_scene:
-        return bundle
+        return mapper
     pixels = min((k.width * k.height for k in log.info.cameras.values()), default=SCENE_RAYS)
     scale = max(request.config.render.scale, min(1.0, (SCENE_RAYS / pixels) ** 0.5))
     render = msgspec.structs.replace(request.config.render, scale=scale)
@@ -206,19 +206,19 @@ class _Labeller:
     ``things`` is the folder for images of things.
     """
 
-    def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest, things: Path | None) -> None:
-        self._bundle, self._pipeline, self._request = bundle, bundle.pipeline, request
-        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))  # of the labels to write
+    def __init__(self, mapper: Mapper, label_set: LabelSet, request: AutolabelRequest, things: Path | None) -> None:
+        self._mapper, self._pipeline, self._request = mapper, mapper.pipeline, request
+        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(mapper.label_set))  # of the labels to write
         self._ignore_id = np.uint8(label_set.ignore_id)
         self._queue: deque[_Message] = deque()
         self._waiting: dict[tuple[str, int, int], list[_Message]] = {}
         self._pixels, self._all_pixels, self._confidence = 0, 0, 0.0
-        self.digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
+        self.digest = hashlib.sha256(mapper.weights_path.read_bytes()).hexdigest()
         self.count = dict.fromkeys(("frames", "labelled", "kept", "replaced", "unlabelled", "depth_written"), 0)
         self.rendered = 0
         self.refused: list[str] = []  # why frames could not be rendered
         self._things = things
-        self._boxed = bundle.checkpoint.model if isinstance(bundle.checkpoint.model, Panoptic) else None
+        self._boxed = mapper.checkpoint.model if isinstance(mapper.checkpoint.model, Panoptic) else None
         self._thing_pixels: dict[int, dict[str, int]] = {}  # by the id of a thing, by frame
 
     def push(self, message: _Message) -> None:
@@ -247,9 +247,9 @@ class _Labeller:
 
     def note(self) -> AutolabelNote:
         """Figures so far."""
-        checkpoint, request = self._bundle.checkpoint, self._request
+        checkpoint, request = self._mapper.checkpoint, self._request
         return AutolabelNote(
-            weights=self._bundle.weights_path.name,
+            weights=self._mapper.weights_path.name,
             digest=self.digest,
             kind=checkpoint.model.kind,
             classes=checkpoint.label_set.names,
@@ -295,7 +295,7 @@ class _Labeller:
             self._all_pixels += sure.size
             self._confidence += float(update.confidence[sure].sum(dtype=np.float64))
         if self._things is not None and self._boxed is not None:
-            unknown = np.uint8(self._bundle.label_set.ignore_id)
+            unknown = np.uint8(self._mapper.label_set.ignore_id)
             ids = thing_image(self._boxed, frame, np.where(confident, update.label, unknown)).instance
             name = f"{frame.camera_id}/{message.number:06d}"
             path = self._things / f"{name}.png"

@@ -73,21 +73,21 @@ def replay_log(
         if fitted:
             _log.warning("settings_fitted", to=fitted)
         config = config if trajectory is None else keeping_frames(config, len(source))
-        bundle = Mapper.load(weights, config)
+        mapper = Mapper.load(weights, config)
         clear_results(out)
         session = MapSession(
-            bundle,
+            mapper,
             stream_labels=source.info.label_set,
             source=source.info.source,
             scale_known=source.info.scale_known,
-            rerun=open_recording(rerun, bundle.pipeline),
+            rerun=open_recording(rerun, mapper.pipeline),
         )
         session.left_out = read_left_out(source.attachments())
         for error in source.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
         total = min(len(source), max_frames or len(source))
         monitor.start(total)
-        _log.info("mapping", log=source.path.name, frames=total, weights=bundle.weights_path.name)
+        _log.info("mapping", log=source.path.name, frames=total, weights=mapper.weights_path.name)
         try:
             for number, item in enumerate(source.frames_or_errors(total)):
                 if isinstance(item, PosedFrame):
@@ -135,18 +135,18 @@ def evaluate_log(
         if stream_labels is None:
             raise LabelError(f"{log}: has no label images to score against")
         _check_scorable(source)
-        bundle = Mapper.load(weights, msgspec.structs.replace(config, depth=depth))
-        checkpoint = bundle.checkpoint
+        mapper = Mapper.load(weights, msgspec.structs.replace(config, depth=depth))
+        checkpoint = mapper.checkpoint
         if not checkpoint.model.knows_classes:
             raise WeightsError(
-                f"{bundle.weights_path}: a field of kind '{checkpoint.model.kind}' knows no classes, so that "
+                f"{mapper.weights_path}: a field of kind '{checkpoint.model.kind}' knows no classes, so that "
                 "there is nothing to score; give weights that were trained on labels"
             )
         panoptic = None
         if instances is not None:
             require_metres(source.info.scale_known, "instances")
             panoptic = PanopticTruth(instances, source, stream_labels, checkpoint.label_set)
-        predictors = methods.field_predictors(bundle)
+        predictors = methods.field_predictors(mapper)
         if baseline_s:
             monitor.start(100)
             predictors |= methods.baseline_predictors(
@@ -165,11 +165,11 @@ def evaluate_log(
             checkpoint.label_set,
             checkpoint.train_stamps_ns,
             on_frame=lambda done: monitor.set(done, "scoring"),
-            voxel_map=bundle.pipeline.voxel_map,
+            voxel_map=mapper.pipeline.voxel_map,
             panoptic=panoptic,
-            things=methods.thing_tellers(bundle),
+            things=methods.thing_tellers(mapper),
         )
-        return replace(found, damaged=len(source.errors), weights=bundle.weights_path.name)
+        return replace(found, damaged=len(source.errors), weights=mapper.weights_path.name)
 
 
 def _check_scorable(log: Log) -> None:

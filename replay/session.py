@@ -1,7 +1,7 @@
 """A mapping session: the pipeline plus the bookkeeping that every replay and every mapper node shares.
 
-``MapSession.process`` is the only way a frame reaches ``MappingPipeline.step``, whether it comes from a socket or from
-a log, so that both write the same map and the same summary.
+``MapSession.process`` takes a frame to ``MappingPipeline.step``, whether it comes from a socket or from a log, so that
+both write the same map and the same summary. Verbs that write no map (`eval`, `autolabel`) step a ``Mapper``.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class MapSession:
 
     def __init__(
         self,
-        bundle: Mapper,
+        mapper: Mapper,
         *,
         stream_labels: LabelSet | None,
         source: str = "",
@@ -110,12 +110,12 @@ class MapSession:
         rerun: RerunLog | None = None,
         own_first: bool = True,
     ) -> None:
-        self.bundle = bundle
-        self.pipeline = bundle.pipeline
+        self.mapper = mapper
+        self.pipeline = mapper.pipeline
         self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
         self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
-        self.exclude_stamps = bundle.checkpoint.train_stamps_ns
+        self.exclude_stamps = mapper.checkpoint.train_stamps_ns
         self.published = self.fused = self.dropped = 0
         self.unreadable = 0  # refused by the player of a log; they never came here
         self.scored = self.excluded = 0
@@ -215,7 +215,7 @@ class MapSession:
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""
-        self.bundle = replace(self.bundle, checkpoint=checkpoint, weights_path=path)
+        self.mapper = replace(self.mapper, checkpoint=checkpoint, weights_path=path)
         self.exclude_stamps |= checkpoint.train_stamps_ns
 
     def follow_correction(self) -> None:
@@ -255,7 +255,7 @@ class MapSession:
     def more_summary(self) -> dict[str, Any]:
         """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
         sessions, found = self.odometry_sessions, dict[str, Any]()
-        model, mapped = self.bundle.checkpoint.model, len(self._known)
+        model, mapped = self.mapper.checkpoint.model, len(self._known)
         if model.holds_scene and model.knows_classes and mapped:
             found["scene"] = {"known": round(sum(self._known) / mapped, 4), "frames_outside": self.outside}
             if self.outside > MOSTLY * mapped:

@@ -17,7 +17,7 @@ from semantic_mapper.errors import LabelError
 from semantic_mapper.types import UInt8
 
 IGNORE_CHANNEL = -1
-MAX_NAME = 128  # letters of a name, as in headers of messages (transport/headers.py)
+MAX_NAME = 128  # letters of a name, as in headers of messages (transport/messages.py)
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,18 +51,18 @@ class _Task:
 class LiveWeights(Closing):
     """Takes, refuses and lists weights, goes back to earlier ones, and publishes which are in use. A context manager.
 
-    ``bundle`` is what the mapper was started with.
+    ``mapper`` is what the node was started with.
     """
 
-    def __init__(self, context: NodeContext, options: MapperOptions, bundle: Mapper, publisher: Publisher) -> None:
+    def __init__(self, context: NodeContext, options: MapperOptions, mapper: Mapper, publisher: Publisher) -> None:
         self._context = context
-        self._bundle = bundle
+        self._mapper = mapper
         self._folder = Path(options.out) / FOLDER
         self._least_agreement = options.min_map_agreement
         self._publisher = publisher
         self._offers = LosslessSubscriber(context.endpoint(options.learner), ("weights",), hwm=_WAITING)
         self._lock = threading.Lock()  # of what requests see and change: versions, counts, the one requested
-        self._versions = {0: WeightsEntry(0, digest_of(bundle.weights_path.read_bytes()), "in use")}
+        self._versions = {0: WeightsEntry(0, digest_of(mapper.weights_path.read_bytes()), "in use")}
         self._in_use = 0
         self._requested: int | None = None
         self._counts = {"taken": 0, "refused": 0, "rolled_back": 0}
@@ -97,7 +97,7 @@ class LiveWeights(Closing):
             requested, self._requested = self._requested, None
         if requested is not None:
             self._end_task("older ones were requested")
-            entry, start = self._versions[requested], self._bundle.checkpoint
+            entry, start = self._versions[requested], self._mapper.checkpoint
             read = partial(read_kept, self._folder, requested, entry.digest, start) if requested else lambda: start
             self._task = _Task(entry, self._reader.submit(read), requested=True)
         task = self._task
@@ -124,7 +124,7 @@ class LiveWeights(Closing):
             self._refuse(entry, f"they were compared with others than those in use (weights {self._in_use})")
             return
         self._end_task("newer ones came")
-        reading = self._reader.submit(keep_offer, update, self._folder, self._bundle.checkpoint)
+        reading = self._reader.submit(keep_offer, update, self._folder, self._mapper.checkpoint)
         self._task = _Task(entry, reading, requested=False)
 
     def describe(self) -> Weights:
@@ -181,7 +181,7 @@ class LiveWeights(Closing):
         task.trial.exchange()
         number, before = task.version.version, self._in_use
         back = number < before
-        file = file_of_version(self._folder, number) if number else self._bundle.weights_path
+        file = file_of_version(self._folder, number) if number else self._mapper.weights_path
         session.follow_weights(checkpoint, file)
         with self._lock:
             self._task = None

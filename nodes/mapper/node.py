@@ -66,8 +66,8 @@ class MapperNode(Closing):
         self._context = context
         self._options = options
         self._out = Path(options.out)
-        self._bundle, self._resumed = _load(context, options)
-        self._pipeline = self._bundle.pipeline
+        self._mapper, self._resumed = _load(context, options)
+        self._pipeline = self._mapper.pipeline
 
         self._session: MapSession | None = None
         self._streams = Streams(len(options.cameras))
@@ -81,7 +81,7 @@ class MapperNode(Closing):
         self._last_trim = time.monotonic()
 
         self._correction = LiveCorrection(self._pipeline)
-        self._autosave = Autosave(self._bundle.voxel_map, self._out / MAP_NAME, options.save_every_s)
+        self._autosave = Autosave(self._mapper.voxel_map, self._out / MAP_NAME, options.save_every_s)
         with ExitStack() as stack:
             publisher = PublicPublisher(context.endpoint(context.name), options.publish, options.keys)
             self._publisher = stack.enter_context(publisher)
@@ -91,16 +91,16 @@ class MapperNode(Closing):
             self._frames = stack.enter_context(subscriber(endpoints, ("info", "frame", "end")))
             self._weights: LiveWeights | None = None
             if options.learner:
-                self._weights = stack.enter_context(LiveWeights(context, options, self._bundle, self._publisher))
+                self._weights = stack.enter_context(LiveWeights(context, options, self._mapper, self._publisher))
             self._queries: QueryService | None = None
             if options.query:
                 keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
                 moving, pose_in_map = self._pipeline.moving.space, self._pipeline.pose_in_map
                 endpoint, parts = context.endpoint(options.query), (self._correction, keys, self._weights)
-                service = QueryService(endpoint, self._bundle.voxel_map, *parts, moving, pose_in_map)
+                service = QueryService(endpoint, self._mapper.voxel_map, *parts, moving, pose_in_map)
                 self._queries = stack.enter_context(service)
             self._resources = stack.pop_all()
-        _log.info("ready", weights=self._bundle.weights_path.name, input=options.cameras, delivery=options.delivery)
+        _log.info("ready", weights=self._mapper.weights_path.name, input=options.cameras, delivery=options.delivery)
 
     def close(self) -> None:
         """Free its sockets and threads."""
@@ -141,7 +141,7 @@ class MapperNode(Closing):
     def _begin_stream(self, info: StreamInfo) -> None:
         # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.
         self._broken |= self._streams.begin(info)
-        self._bundle.voxel_map.note_scale(info.scale_known)  # of further streams, too
+        self._mapper.voxel_map.note_scale(info.scale_known)  # of further streams, too
         if self._session is not None:
             self._session.source = self._streams.source
             return
@@ -149,9 +149,9 @@ class MapperNode(Closing):
             saved_map.keep_earlier(self._context, self._out / MAP_NAME)
         clear_results(self._out)
         self._session = MapSession(
-            self._bundle, stream_labels=info.label_set, source=info.source, own_first=not self._options.map
+            self._mapper, stream_labels=info.label_set, source=info.source, own_first=not self._options.map
         )
-        if self._bundle.voxel_map.frames:
+        if self._mapper.voxel_map.frames:
             self._session.odometry_sessions.known.update(saved_map.noted_sessions(self._context))
         _log.info("stream_begins", source=info.source, frames=info.frame_count)
 
@@ -214,10 +214,10 @@ class MapperNode(Closing):
         """Write what there is."""
         self._frames.close()  # the camera waits until all have left
         if self._session is None:
-            if not self._bundle.voxel_map.frames:
+            if not self._mapper.voxel_map.frames:
                 _log.warning("nothing_to_write", reason="no stream has begun")
                 return
-            self._session = MapSession(self._bundle, stream_labels=None)  # of the map that was saved before a restart
+            self._session = MapSession(self._mapper, stream_labels=None)  # of the map that was saved before a restart
         self._publish_status("stopping", now=True)
         self._autosave.close()
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_correcting)
@@ -287,8 +287,8 @@ def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
         file = map_path(Path(options.map))
         config = saved_map.stored_settings(config, path, options.voxel_size_m, file)
         saved = VoxelMap.load(file, config=config.voxel_map)
-    bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
-    resumed = saved_map.resume_map(context, Path(options.out) / MAP_NAME, bundle.voxel_map)
+    mapper = Mapper.load(Path(options.weights) if options.weights else None, config)
+    resumed = saved_map.resume_map(context, Path(options.out) / MAP_NAME, mapper.voxel_map)
     if saved is not None:
-        saved_map.continue_map(bundle.voxel_map, saved, options.map)
-    return bundle, resumed
+        saved_map.continue_map(mapper.voxel_map, saved, options.map)
+    return mapper, resumed

@@ -32,14 +32,14 @@ def show_log(
     ``begin`` is called once log and weights are open; it goes on while ``going()``. Raises LogError, WeightsError,
     ConfigError, MapError: it cannot be mapped.
     """
-    bundle = Mapper.load(weights, config)
-    pipeline = bundle.pipeline
+    mapper = Mapper.load(weights, config)
+    pipeline = mapper.pipeline
     voxel_map = pipeline.voxel_map
     with open_log(path) as reader:
         log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
         show, mirror = MapShow(log), MapMirror.of(voxel_map)
         session = MapSession(
-            bundle, stream_labels=None, source=reader.info.source, scale_known=reader.info.scale_known, rerun=log
+            mapper, stream_labels=None, source=reader.info.source, scale_known=reader.info.scale_known, rerun=log
         )
         total = min(len(reader), frames or len(reader))
         monitor.start(total)

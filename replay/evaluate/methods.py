@@ -95,14 +95,14 @@ class _Scores:
         }
 
 
-def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
+def field_predictors(mapper: Mapper) -> dict[str, Predictor]:
     """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
     encoder says of the frame alone, where it has an opinion of single images."""
-    config, model = bundle.pipeline.config, bundle.checkpoint.model
+    config, model = mapper.pipeline.config, mapper.checkpoint.model
     keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
     novel = msgspec.structs.replace(config, keyframes=keyframes)
     pipeline = MappingPipeline(
-        novel, make_field(model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
+        novel, make_field(model, novel), mapper.pipeline.label_set, anchors=mapper.checkpoint.anchors
     )
 
     def predictor(pipeline: MappingPipeline) -> Predictor:
@@ -124,13 +124,13 @@ def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
             confidence, channel = torch.softmax(large[0], dim=0).max(dim=0)
         return Opinion(model.label_set.to_ids(channel.numpy()), confidence.numpy())
 
-    found = {model.kind: predictor(bundle.pipeline), f"{model.kind}, novel view": predictor(pipeline)}
+    found = {model.kind: predictor(mapper.pipeline), f"{model.kind}, novel view": predictor(pipeline)}
     return found | ({"own image alone": of_image} if model.classifies_images and model.kind != "unet" else {})
 
 
-def thing_tellers(bundle: Mapper) -> dict[str, ThingTeller]:
+def thing_tellers(mapper: Mapper) -> dict[str, ThingTeller]:
     """The predictors of ``field_predictors`` that tell things apart by themselves, and how: those of boxes."""
-    model = bundle.checkpoint.model
+    model = mapper.checkpoint.model
     return {model.kind: partial(thing_image, model)} if isinstance(model, Panoptic) else {}
 
 

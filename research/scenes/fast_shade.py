@@ -15,12 +15,6 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.types import Float32, Float64, Int32, Int64
 
-# As in fast_shade.c.
-SHADOW_BIAS_M = 0.03
-LIGHT_RADIUS_SQ = 0.5  # softens the fall-off near a light, square metres
-CORNER_DIM = 0.3  # fraction of the ambient light that a wall, floor or ceiling takes from what touches it
-CORNER_REACH_M = 0.18
-
 
 class PrimitiveArrays(NamedTuple):
     """What the shading reads of ``Primitives``."""

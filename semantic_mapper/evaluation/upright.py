@@ -67,7 +67,7 @@ def find_upright(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
 
 
 def plan_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
-    """Rotation (3, 3) from the world to the frame of an exported floor plan (``mapping.occupancy``): z is up, and x and
+    """Rotation (3, 3) from the world to the frame of an exported floor plan (``mapping.floor_plan``): z is up, x and
     y are those of the world where its z is up, too. Arguments and errors are those of ``upright_rotation``."""
     return turn_onto(find_upright(xyz, up), np.array((0.0, 0.0, 1.0)))
 

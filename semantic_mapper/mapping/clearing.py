@@ -1,6 +1,6 @@
 """Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
 
-A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
+A voxel is part of a surface where its TSDF is below ``LARGEST_CLEARED_TSDF``. A frame sees through it where its pixel is
 measured, of the eight around at most ``MOST_HOLES`` are not, and all that is measured in its surroundings lies well
 behind it. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin
 things, depth edges and grazing views are safe; the margin grows with voxels and depth (``MARGIN_VOXELS``,
@@ -12,7 +12,7 @@ left, the voxel becomes free and loses its votes: three frames clear any surface
 seen through in every second frame or less, as by mirrors, stays.
 
 Blocks of the truncation band are cleared while they are fused (``fusion.c``). This module clears the others in view.
-Its numbers stand in ``see_through.h``, too."""
+The numbers stand in ``kernels/src/see_through.h``."""
 
 from __future__ import annotations
 
@@ -27,11 +27,6 @@ from semantic_mapper.mapping.block_grid import BlockGrid, GridBuffers
 from semantic_mapper.mapping.blocks import find_blocks, pack_keys, unpack_keys
 from semantic_mapper.types import Float32, Int32, Int64, UInt8
 
-LARGEST_TSDF = 0.5
-MARGIN_VOXELS, MARGIN_PER_M = 2.0, 0.015
-ASIDE_VOXELS, ASIDE_PER_M = 1.4, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
-MOST_HOLES = 2
-MOST_KEPT = 3.5
 _CELLS = 320  # along the longer side of an image, at least; a cell has 2 x 2 pixels at 640 x 480
 _COARSE = 8  # cells a side of those of ``farthest``
 _LEVELS = 6  # squares of up to 64 cells a side

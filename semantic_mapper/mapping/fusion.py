@@ -29,7 +29,6 @@ COMPUTED_LOOK = 1 / 32
 COMPUTED_CAP = 31 / 32
 SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surface: four sure looks, or more unsure ones
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
-LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
 
 _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end

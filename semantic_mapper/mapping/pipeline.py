@@ -110,6 +110,7 @@ class MappingPipeline:
             sources = self._timed("choose", self._choose_sources, views, current, self.keyframes)
             view, votes = self._timed("render", self._render_semantics, views, sources, current)
             moving = self._timed("motion", self.moving.find, views.frame)
+            # From here on without what moves (``full.views``): it is published, but neither fused nor kept.
             full = self._timed("upsample", self._upsample_still, views, votes, moving)
             touched = self._timed("fuse", self._fuse, self.voxel_map, full, votes)
             if self.corrector.records:

@@ -216,7 +216,7 @@ def upsample_view(
     colour_rate: float,
     depth_sigma: float,
     largest_step: float,
-    sample_weight_threshold: float,
+    least_weight: float,
 ) -> None:
     """``upsample`` of ``count`` rows; ``look`` (h, w, 4) is colour and depth of the coarse pixels."""
     ...

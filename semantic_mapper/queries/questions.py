@@ -164,7 +164,7 @@ class NearestRequest(Request[NearestSurface | None], frozen=True, kw_only=True):
 
 
 class RaysRequest(Request[RayHits], frozen=True, kw_only=True):
-    """What rays meet; see ``rays.cast_rays``."""
+    """What rays meet; see ``surface.cast_rays``."""
 
     max_m: Finite
     origins: Float64

@@ -65,8 +65,8 @@ def cells(page: ElementTree.Element) -> dict[str, list[str]]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a session of three frames and a refused one leaves."""
     out = tmp_path_factory.mktemp("run")
-    bundle = Mapper.load(write_weights(out / "w.safetensors"), tiny_config())
-    session = MapSession(bundle, stream_labels=ROOMS, source="<room> & hall")
+    mapper = Mapper.load(write_weights(out / "w.safetensors"), tiny_config())
+    session = MapSession(mapper, stream_labels=ROOMS, source="<room> & hall")
     for frame in tiny_frames()[:3]:
         session.process(frame)
     session.refuse(3, 77, "a pose that is no <pose>")

@@ -36,9 +36,9 @@ def weights(tmp_path):
 
 
 def run(weights, frames, rerun=None, depth="auto", **options):
-    bundle = Mapper.load(weights, tiny_config(depth={"source": depth}))
-    recording = open_recording(rerun, bundle.pipeline)
-    session = MapSession(bundle, stream_labels=ROOMS, source="test", rerun=recording, **options)
+    mapper = Mapper.load(weights, tiny_config(depth={"source": depth}))
+    recording = open_recording(rerun, mapper.pipeline)
+    session = MapSession(mapper, stream_labels=ROOMS, source="test", rerun=recording, **options)
     for frame in frames:
         session.process(frame)
     return session
@@ -257,9 +257,9 @@ def test_surface_truth_is_the_majority_of_the_frames_that_see_the_point():
 
 def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights):
     frames = list(tiny_frames())
-    bundle = Mapper.load(weights, tiny_config())
+    mapper = Mapper.load(weights, tiny_config())
     keyframes = [frames[1], frames[4]]
-    predictors = field_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
+    predictors = field_predictors(mapper) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
     excluded = frozenset(f.stamp_ns for f in keyframes)
     result = evaluate_frames(frames, predictors, ROOMS, ROOMS, excluded)
     own = {"sray", "sray, novel view", "own image alone"}

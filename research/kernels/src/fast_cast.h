@@ -1,4 +1,4 @@
-/* Where a ray first meets a primitive of a room; see scenes/fast_cast.py and, for the same in torch, research/tests/scenes/torch_renderer.py. */
+/* Where a ray first meets a primitive of a room; see scenes/fast_cast.py. */
 #pragma once
 
 #include "kernels.h"

@@ -1,4 +1,4 @@
-/* The procedural patterns; research/tests/scenes/torch_textures.py holds their twins in torch. */
+/* The procedural patterns. */
 #pragma once
 
 #include "kernels.h"

@@ -19,7 +19,6 @@ from semantic_mapper.geometry import interpolate_pose
 from semantic_mapper.types import Float64, Int64
 
 ShapeName = Literal["box", "ellipsoid", "prism", "mesh"]
-SHAPES: tuple[ShapeName, ...] = ("box", "ellipsoid", "prism", "mesh")
 AROUND, RINGS = 20, 10  # of the triangles of an ellipsoid
 ROUNDING = 1e-9  # of a size: nothing is moved by less
 ALONE_NS = 50_000_000  # a pose at one time alone holds for so long before and after

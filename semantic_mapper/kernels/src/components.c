@@ -1,4 +1,4 @@
-/* Surface voxels of one class that touch by face, edge or corner; see queries/components.py. */
+/* Surface voxels of one class that touch by face, edge or corner; see queries/instances.py. */
 #include "block_index.h"
 
 typedef struct {

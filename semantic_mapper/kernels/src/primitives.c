@@ -1,4 +1,4 @@
-/* Rays through closed triangle meshes; see fields/primitives.py. */
+/* Rays through closed triangle meshes; see fields/scene/primitives.py. */
 #include "kernels.h"
 
 #define MAX_HITS 128 /* of a ray with one mesh */

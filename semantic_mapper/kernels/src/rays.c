@@ -1,4 +1,4 @@
-/* What rays meet in a snapshot; see queries/rays.py. */
+/* What rays meet in a snapshot; see queries/surface.py. */
 #include "ray_casting.h"
 #include "snapshot.h"
 

@@ -1,4 +1,4 @@
-/* Rays through a scene grid, forwards and backwards; see fields/grid/kernels.py. */
+/* Rays through a scene grid, forwards and backwards; see fields/scene/march.py. */
 #include "scene_grid.h"
 
 #include <stdlib.h>

@@ -5,7 +5,7 @@
 
 #include "voxel_lookup.h"
 
-#define LARGEST_CLEARED_TSDF 0.5f /* of a voxel that is part of a surface; of mapping/clearing.py, as the next */
+#define LARGEST_CLEARED_TSDF 0.5f /* of a voxel that is part of a surface */
 #define MARGIN_VOXELS 2.0f
 #define MARGIN_PER_M 0.015f
 #define ASIDE_VOXELS 1.4f

@@ -1,4 +1,4 @@
-/* Fills the pixels between those that have rays, and how uncertain they are: see fields/sparse_render.py. */
+/* Fills the pixels between those that have rays, and how uncertain they are: see fields/render.py. */
 #include <math.h>
 
 #include "kernels.h"

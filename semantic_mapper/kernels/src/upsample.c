@@ -31,7 +31,7 @@ typedef struct {
     U8 rgb;            /* (H, W, 3) */
     F32 depth;         /* (H, W) */
     I32 out;           /* (H, W) */
-    double colour_rate, depth_sigma, largest_step, sample_weight_threshold;
+    double colour_rate, depth_sigma, largest_step, least_weight;
 } UpsampleArguments;
 
 /* The coarse pixels round one full pixel. */
@@ -104,7 +104,7 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
                 float cost = (r * r + g * g + b * b) * colour_rate + dy * dy + dx * dx;
                 if (look[3] > 0) cost += min_f(step * step, largest_step);
                 taps.index[taps.count] = from, taps.channel[taps.count] = a->channel.data[from];
-                taps.weight[taps.count++] = fast_exp(-cost) + (float)a->sample_weight_threshold;
+                taps.weight[taps.count++] = fast_exp(-cost) + (float)a->least_weight;
             }
         a->out.data[at] = (int32_t)nearest_of_class(&taps, &a->probabilities);
     }

@@ -197,8 +197,8 @@ def answered(pipeline: MappingPipeline) -> Iterator[tuple[LiveCorrection, MapCli
         yield correction, client
 
 
-def session_of(bundle, frames: list[PosedFrame] | tuple[PosedFrame, ...]) -> MapSession:
-    session = MapSession(bundle, stream_labels=ROOMS)
+def session_of(mapper, frames: list[PosedFrame] | tuple[PosedFrame, ...]) -> MapSession:
+    session = MapSession(mapper, stream_labels=ROOMS)
     for frame in frames:
         session.process(frame)
     return session
