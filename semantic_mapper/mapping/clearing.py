@@ -1,7 +1,7 @@
 """Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
 
-A voxel is part of a surface where its TSDF is below ``LARGEST_CLEARED_TSDF``. A frame sees through it where its pixel is
-measured, of the eight around at most ``MOST_HOLES`` are not, and all that is measured in its surroundings lies well
+A voxel is part of a surface where its TSDF is below ``LARGEST_CLEARED_TSDF``. A frame sees through it where its pixel
+is measured, of the eight around at most ``MOST_HOLES`` are not, and all that is measured in its surroundings lies well
 behind it. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin
 things, depth edges and grazing views are safe; the margin grows with voxels and depth (``MARGIN_VOXELS``,
 ``MARGIN_PER_M``). Pixels without depth, beyond ``depth_max``, near the edge of the image, or of computed depth clear
