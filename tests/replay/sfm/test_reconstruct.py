@@ -153,4 +153,4 @@ def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked:
     summary = json.loads((out / "summary.json").read_text())
     assert summary["weights"]["file"] == "rooms-computed-depth.safetensors"
     assert summary["scale"] == "unknown" and summary["frames"]["left_out"] + summary["frames"]["published"] == COUNT
-    assert {"room.mcap", "room.html", "report.html", "map.ply", "map.npz"} <= {file.name for file in out.iterdir()}
+    assert {"room.mcap", "report.html", "map.ply", "map.npz"} <= {file.name for file in out.iterdir()}
