@@ -58,6 +58,7 @@ test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtu
 	.venv/bin/python -m research.experiments.v4l2_machine
 
 test-web: $(READY)  ## try the labelling page in a headless browser
+	.venv/bin/python -m tests.browser
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
 check: $(READY)  ## formatting, lint, types, import contracts

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import scipy  # loads `spatial` when it is first used
 from numpy.typing import NDArray
 
 from semantic_mapper import plots
@@ -320,7 +319,9 @@ def point_spacing(xyz: Float64) -> float:
     if len(xyz) < 5:
         return 0.05
     asking = xyz[:: max(1, len(xyz) // 500)]
-    distances, _ = scipy.spatial.KDTree(xyz).query(asking, k=5)
+    from scipy.spatial import KDTree  # here, since training machines may lack SciPy
+
+    distances, _ = KDTree(xyz).query(asking, k=5)
     return float(np.percentile(distances[:, 4], 75))
 
 

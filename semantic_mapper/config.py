@@ -349,7 +349,7 @@ def check_quality(data: Mapping[str, Any], quality: Quality, where: str) -> None
         data: The mapper's config as the file ``where`` has it, of the right form.
         quality: In force, whether the file asks for it or somebody else.
     """
-    if quality == "custom":
+    if quality not in QUALITIES:  # "custom"; what is not valid at all is refused with the other settings
         return
     clashes = [
         f"{section}.{name} = {data[section][name]!r} ({quality}: {value!r})"

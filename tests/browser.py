@@ -11,6 +11,7 @@ import os
 import platform
 import select
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -174,3 +175,8 @@ class Browser:
             case _:
                 pass
         return message
+
+
+if __name__ == "__main__":
+    if why := provide_browser():
+        sys.exit(f"no browser: {why}")

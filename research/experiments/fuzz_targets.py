@@ -140,7 +140,7 @@ def _example(name: str, hint: Any) -> Any:
     if get_origin(hint) is Annotated:
         return _example(name, get_args(hint)[0])
     if get_origin(hint) is tuple:
-        return tuple(_example("", part) for part in get_args(hint))
+        return tuple(_example("", part) for part in get_args(hint) if part is not Ellipsis)
     if hint in (int, float, bool, str):
         return hint(1)
     fields = {key: part for key, part in get_type_hints(hint, include_extras=True).items() if part not in _CLASS_VARS}

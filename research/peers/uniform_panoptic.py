@@ -9,6 +9,8 @@ from semantic_mapper.fields.scene.grid import RaySamples, heaviest
 from semantic_mapper.fields.scene.march import BIAS, KEPT, gather
 from semantic_mapper.fields.scene.panoptic import LEAST, Panoptic
 from semantic_mapper.fields.volume import interval_lengths
+from semantic_mapper.training.finetune import FITTERS
+from semantic_mapper.training.panoptic import fit_panoptic
 from semantic_mapper.types import RayBatch
 
 
@@ -37,3 +39,6 @@ class UniformPanoptic(Panoptic):
         before = torch.cumsum(depth, 1) - depth
         weight = torch.exp(-before) * -torch.expm1(-depth)
         return RaySamples(rays, points, z, weight, 1 - weight.sum(1))
+
+
+FITTERS[UniformPanoptic.kind] = fit_panoptic

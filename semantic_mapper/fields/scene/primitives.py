@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull  # pyright: ignore[reportMissingTypeStubs]
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import interpolate_pose
@@ -207,6 +206,9 @@ def _sphere() -> tuple[Float64, Int64]:
     theta, phi = np.pi * np.arange(1, RINGS)[:, None] / RINGS, 2 * np.pi * np.arange(AROUND) / AROUND
     ring = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi), -1)
     vertices = 0.5 * np.concatenate(([(0, 0, 1)], ring.reshape(-1, 3), [(0, 0, -1)]))
+    # Here, since training machines may lack SciPy.
+    from scipy.spatial import ConvexHull  # pyright: ignore[reportMissingTypeStubs]
+
     hull = ConvexHull(vertices)
     return vertices * (math.pi / 6 / hull.volume) ** (1 / 3), hull.simplices.astype(np.int64)
 
