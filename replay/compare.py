@@ -138,14 +138,14 @@ def _map_figures(a: VoxelMap, b: VoxelMap, tolerances: Tolerances) -> Iterator[D
 
 def _distances(a: VoxelMap, b: VoxelMap) -> tuple[float | None, float | None]:
     """How far the surface of ``a`` is from that of ``b`` (95th percentile, metres), and the fraction of it within a
-    voxel whose nearest point has another class; None where only one of the maps has a surface."""
+    voxel whose nearest point has another class; None where only one of the maps has a surface, or nothing in common."""
     mine, others = a.points(), b.points()
     if not len(mine.xyz) or not len(others.xyz):
         return (0.0, 0.0) if len(mine.xyz) == len(others.xyz) else (None, None)
     distance, nearest = cKDTree(others.xyz).query(mine.xyz, workers=-1)
     common = distance <= max(a.config.voxel_size_m, b.config.voxel_size_m)
     other = _names(a)[mine.label[common]] != _names(b)[others.label[nearest[common]]]
-    return float(np.percentile(distance, 95)), float(other.mean()) if len(other) else 0.0
+    return float(np.percentile(distance, 95)), float(other.mean()) if len(other) else None
 
 
 def _names(voxel_map: VoxelMap) -> NDArray[np.str_]:

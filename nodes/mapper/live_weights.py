@@ -48,6 +48,12 @@ class _Task:
     trial: FieldTrial | None = None
 
 
+def started_with(mapper: Mapper) -> Weights:
+    """The weights of a mapper that takes no others."""
+    entry = WeightsEntry(0, digest_of(mapper.weights_path.read_bytes()), "in use")
+    return Weights(0, None, None, 0, 0, 0, (entry,))
+
+
 class LiveWeights(Closing):
     """Takes, refuses and lists weights, goes back to earlier ones, and publishes which are in use. A context manager.
 

@@ -18,7 +18,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
 from semantic_mapper.nodes.mapper import saved_map
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
-from semantic_mapper.nodes.mapper.live_weights import LiveWeights
+from semantic_mapper.nodes.mapper.live_weights import LiveWeights, started_with
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.mapper.saved_map import Autosave
 from semantic_mapper.nodes.node import NodeContext
@@ -94,10 +94,15 @@ class MapperNode(Closing):
                 self._weights = stack.enter_context(LiveWeights(context, options, self._mapper, self._publisher))
             self._queries: QueryService | None = None
             if options.query:
-                keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
-                moving, pose_in_map = self._pipeline.moving.space, self._pipeline.pose_in_map
-                endpoint, parts = context.endpoint(options.query), (self._correction, keys, self._weights)
-                service = QueryService(endpoint, self._mapper.voxel_map, *parts, moving, pose_in_map)
+                service = QueryService(
+                    context.endpoint(options.query),
+                    self._mapper.voxel_map,
+                    self._correction,
+                    load_keys(Path(options.keys).expanduser()) if options.keys else None,
+                    self._weights or started_with(self._mapper),
+                    self._pipeline.moving.space,
+                    self._pipeline.pose_in_map,
+                )
                 self._queries = stack.enter_context(service)
             self._resources = stack.pop_all()
         _log.info("ready", weights=self._mapper.weights_path.name, input=options.cameras, delivery=options.delivery)

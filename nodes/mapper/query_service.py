@@ -88,7 +88,7 @@ class QueryService(Closing):
         voxel_map: VoxelMap,
         correction: LiveCorrection | None = None,
         keys: Keys | None = None,
-        weights: LiveWeights | None = None,
+        weights: LiveWeights | questions.Weights | None = None,
         moving: MovingSpace | None = None,
         pose_in_map: PoseInMap | None = None,
     ) -> None:
@@ -281,7 +281,9 @@ class QueryService(Closing):
                 is_new = isinstance(request, questions.CorrectPosesRequest)
                 return self._correction.begin(request) if is_new else self._correction.describe()
             case questions.WeightsRequest():
-                if self._weights is None:
+                if isinstance(self._weights, questions.Weights) and request.to is None:
+                    return self._weights
+                if not isinstance(self._weights, LiveWeights):
                     raise MapError("this mapper takes no weights while it runs (option `learner`)")
                 return self._weights.describe() if request.to is None else self._weights.return_to(request.to)
             case questions.PoseRequest():

@@ -68,6 +68,7 @@ def test_a_live_map_without_metres(weights: Path, tmp_path: Path) -> None:
             with pytest.raises(MapError, match="scale is unknown"):
                 ask()
         assert client.mirror().snapshot().block_count > 0  # shown and counted all the same
+        assert [version.state for version in client.weights().versions] == ["in use"]
         client.correct_poses(true_poses(frames, 1))
         settle(client)
         assert eventually(lambda: client.info().epoch == 1) and not client.info().scale_known
