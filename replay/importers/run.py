@@ -17,6 +17,7 @@ from semantic_mapper.replay.importers.posed import PosedPictures
 from semantic_mapper.replay.importers.rooms import open_replica, open_scannet
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.rosbag import open_rosbag
+from semantic_mapper.replay.importers.seven_scenes import MARKS, open_seven_scenes
 from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import open_tum
 from semantic_mapper.replay.log.format import LogReader, atomic_log
@@ -30,6 +31,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
     "tum": open_tum,
     "scannet": open_scannet,
     "replica": open_replica,
+    "7-scenes": open_seven_scenes,
     "kitti360": open_kitti360,
     "rosbag": open_rosbag,
     "polycam": open_polycam,
@@ -45,6 +47,7 @@ _MARKS = {
     "tum": ("rgb.txt", "groundtruth.txt"),
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
+    "7-scenes": MARKS,
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
     "polycam": ("keyframes",),
     "record3d": ("rgb", "metadata.json"),
@@ -119,7 +122,7 @@ def _by_marks(src: Path) -> str | None:
 
 def _lacks(src: Path, name: str) -> list[str]:
     """Files and folders of a format that a folder does not have."""
-    return [mark for mark in _MARKS[name] if not (src / mark).exists()]
+    return [mark for mark in _MARKS[name] if next(src.glob(mark), None) is None]
 
 
 def _what_folder(src: Path) -> str:

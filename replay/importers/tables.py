@@ -37,7 +37,7 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], notices: list[str]) 
     """
     found: dict[int, Path] = {}
     left_out: list[str] = []
-    files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes] if folder.is_dir() else []
+    files = [file for file in folder.iterdir() if file.name.lower().endswith(suffixes)] if folder.is_dir() else []
     numbers = {file: [int(n) for n in re.findall(r"\d{1,18}", file.stem)] for file in sorted(files)}
     which = max((0, -1), key=lambda place: len({of[place] for of in numbers.values() if of}))
     for file, of in numbers.items():
