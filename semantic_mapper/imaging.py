@@ -98,6 +98,20 @@ def resize_label(label: UInt8, intrinsics: CameraIntrinsics) -> UInt8:
     return np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)
 
 
+def resize_frame(frame: PosedFrame, intrinsics: CameraIntrinsics) -> PosedFrame:
+    """The frame with all its images at the size of ``intrinsics``; itself where it has that."""
+    if intrinsics == frame.intrinsics:
+        return frame
+    return replace(
+        frame,
+        rgb=resize_rgb(frame, intrinsics),
+        depth_m=None if frame.depth_m is None else resize_depth(frame, intrinsics),
+        depth_sigma_m=resize_spread(frame, intrinsics),
+        label=None if frame.label is None else resize_label(frame.label, intrinsics),
+        intrinsics=intrinsics,
+    )
+
+
 def fill_holes(depth_m: Float32) -> Float32:
     """Give pixels without depth that of the nearest pixel with one; all 0 stays all 0."""
     holes = (depth_m <= 0).astype(np.uint8)

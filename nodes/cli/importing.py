@@ -17,7 +17,7 @@ from semantic_mapper.nodes.cli.calibrate import board_settings
 from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.importers.base import ImportOptions, ImportReport, RenameConfig
+from semantic_mapper.replay.importers.base import MEGAPIXELS, ImportOptions, ImportReport, RenameConfig
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.run import FORMATS, import_recording, is_recording
 from semantic_mapper.replay.log.format import recover
@@ -87,10 +87,11 @@ def import_(
     log: Path,  # log to write (.mcap)
     options: SourceOptions,
     *,
-    # folder, tum, scannet, replica, kitti360, rosbag, polycam, record3d, transforms, colmap or opensfm [found out]
+    # folder, tum, scannet, replica, 7-scenes, kitti360, rosbag, polycam, record3d, transforms, colmap or opensfm [found out]
     format_: str | None = None,
     max_frames: MaxFramesOption = 0,
     every: AtLeastOne = 1,  # only every N-th frame
+    megapixels: AtLeastZero = MEGAPIXELS,  # larger pictures of a recording are made smaller; 0 = never
     rename: Path | None = None,  # TOML: [classes] couch = "sofa", ...
     # bags: of image, depth, info, depth_info or pose; repeated. depth=none (any format): without depth
     topic: Annotated[list[str] | None, typer.Option(metavar="ROLE=NAME")] = None,
@@ -114,10 +115,16 @@ def import_(
         return
     renames = load_config(rename, RenameConfig).classes if rename is not None else {}
     log.parent.mkdir(parents=True, exist_ok=True)
-    if format_ is None and is_film(source) and (rename is not None or max_frames or every > 1):
-        raise typer.BadParameter("a film has no classes to rename, and all of it is read")
+    if (
+        format_ is None
+        and is_film(source)
+        and (rename is not None or max_frames or every > 1 or megapixels != MEGAPIXELS)
+    ):
+        raise typer.BadParameter("a film has no classes to rename, and all of it is read, in a size of its own")
     topics = _topics_by_role(topic or [])
-    reading = ImportOptions(every, max_frames or None, topics=topics, renames=renames, world=world, body=body)
+    reading = ImportOptions(
+        every, max_frames or None, megapixels=megapixels, topics=topics, renames=renames, world=world, body=body
+    )
     import_source(output, source, log, options, format_, reading, overwrite=overwrite)
 
 
@@ -143,7 +150,12 @@ def import_source(
     if format_name is None and is_film(source):
         _import_film(output, source, log, options.film_options(), overwrite=overwrite)
         return 0
-    reading = replace(reading or ImportOptions(), quarters=options.quarters, scale=options.recording_scale())
+    reading = replace(
+        reading or ImportOptions(),
+        quarters=options.quarters,
+        megapixels=options.megapixels,
+        scale=options.recording_scale(),
+    )
     with frame_progress("import", None) as bar:
 
         def on_progress(done: int, total: int) -> None:

@@ -29,6 +29,7 @@ PICTURES = (".jpg", ".jpeg", ".png")
 DEPTHS = (".png", ".npy", ".npz")
 CAMERA_ID = "camera"  # in the log, of recordings of one camera
 MATCH_NS = 20_000_000  # TUM and ROS bags: largest time between a colour image, its depth image and its pose
+MEGAPIXELS = 1.3
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses
 
 
@@ -40,6 +41,7 @@ class ImportOptions:
     max_frames: int | None = None  # stop after this many frames; None = all
     # turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side
     quarters: int = 0
+    megapixels: float = MEGAPIXELS  # larger pictures are made smaller, to about this; 0 = none is
     # ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), where several fit. Depth "none", of
     # every format: without.
     topics: Mapping[str, str] = field(default_factory=dict[str, str])

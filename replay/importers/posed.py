@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,7 +14,7 @@ import numpy as np
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ConfigError, ImportSourceError, LabelError
 from semantic_mapper.geometry import camera_matrix, scale_intrinsics
-from semantic_mapper.imaging import rotate_frame, rotate_intrinsics
+from semantic_mapper.imaging import resize_frame, rotate_frame, rotate_intrinsics, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
@@ -30,9 +31,11 @@ from semantic_mapper.replay.importers.base import (
 )
 from semantic_mapper.replay.importers.tables import left_out_notice
 from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.images import encode_rgb
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
+JPEG_QUALITY = 95  # of pictures that were JPEG files and are made smaller
 KEPT_RECTIFIERS = 8  # of some megabytes each
 SHIFT_NS = 1_000_000  # between pictures of one time
 DEFAULT_HZ = 2.0  # at which pictures without times count as taken
@@ -130,10 +133,13 @@ class PosedPictures:
             if labels is None:
                 raise LabelError(f"{source}: there are no classes to rename, it has no labels")
             labels, self._new_ids = labels.renamed(options.renames)
-        self._quarters = options.quarters
+        self._quarters, self._pixels = options.quarters, round(options.megapixels * 1e6) or math.inf
+        smaller = {f"{k.width}x{k.height}": self._smaller(k) for k in cameras.values() if self._smaller(k) != k}
+        for size, k in smaller.items():
+            self.notices.append(f"pictures of {size} are made {k.width}x{k.height} (--megapixels)")
         self.info = StreamInfo(
             source=source,
-            cameras={name: rotate_intrinsics(k, self._quarters) for name, k in sorted(cameras.items())},
+            cameras={name: self._smaller(rotate_intrinsics(k, self._quarters)) for name, k in sorted(cameras.items())},
             label_set=labels,
             frame_hz=hz,
             metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
@@ -187,8 +193,19 @@ class PosedPictures:
             depth_sigma_m=sigma,
             label_is_pseudo=picture.pseudo_label and label is not None,
         )
-        unchanged = None if changed or self._quarters % 4 else encoded
-        return LoadedFrame(rotate_frame(frame, self._quarters), unchanged, label_error)
+        was_jpeg = encoded is not None and encoded.encoding == "jpeg"
+        if changed or self._quarters % 4:
+            encoded = None
+        frame = rotate_frame(frame, self._quarters)
+        if (smaller := self._smaller(frame.intrinsics)) != frame.intrinsics:
+            frame = resize_frame(frame, smaller)
+            encoded = EncodedImage("jpeg", encode_rgb(frame.rgb, "jpeg", JPEG_QUALITY)) if was_jpeg else None
+        return LoadedFrame(frame, encoded, label_error)
+
+    def _smaller(self, k: CameraIntrinsics) -> CameraIntrinsics:
+        """Intrinsics of the picture as the log has it."""
+        factor = (self._pixels / (k.width * k.height)) ** 0.5
+        return k if factor >= 1 else working_intrinsics(k, round(k.width * factor / 4) * 4)
 
     def _depth(self, file: Path, lens: Rectifier, rgb: UInt8, confidence: Path | None = None) -> Float32:
         """Depth, or its spread, (H, W) in metres, in the pixels of the rectified picture."""

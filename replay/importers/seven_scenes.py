@@ -15,10 +15,15 @@ import numpy as np
 
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import invert_pose
-from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, read_depth
+from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.replay.importers.base import (
+    BadFrameError,
+    DepthScale,
+    ImportOptions,
+    depth_of_points,
+    read_depth,
+)
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.rosbag import register_depth
 from semantic_mapper.replay.importers.tables import numbered_files, read_matrix, without_picture
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
@@ -65,7 +70,8 @@ def open_seven_scenes(folder: Path, options: ImportOptions) -> PosedPictures:
                 picture.depth_file, f"is not {_DEPTH.width}x{_DEPTH.height}, as depth of the data set is"
             )
         depth_m[depth_m >= _NO_DEPTH_M] = 0
-        return register_depth(depth_m, _DEPTH, T_COLOR_DEPTH, lens.intrinsics)
+        points = unproject(depth_m, _DEPTH)[depth_m > 0]
+        return depth_of_points(transform(T_COLOR_DEPTH, points), lens.intrinsics)
 
     source = f"7-scenes {folder.resolve().parent.name} {folder.resolve().name}"
     return PosedPictures(source, pictures, options, SCALE, notices, hz=HZ, read_depth=registered)

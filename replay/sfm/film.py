@@ -4,6 +4,7 @@ ones, a step of motion apart; their features; and what a log keeps of its film."
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +129,28 @@ class Film:
 
 
 def pictures_of(folder: Path) -> list[Path]:
-    """Pictures of a folder by the numbers in their names, as people order them: 9 comes before 10."""
+    """Pictures of a folder, or of its only sub-folder that has some, as people order them: 9 comes before 10.
+
+    Raises ImportSourceError: they are of several kinds, as colour and depth are, which no film is.
+    """
+    places = {place: _pictures_in(place) for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir()))}
+    filled = [files for files in places.values() if files]
+    files = places[folder] or (filled[0] if len(filled) == 1 else [])
+    numbers: dict[str, set[str]] = {}
+    for file in files:
+        numbers.setdefault(re.sub(r"\d+", "N", file.name), set()).add(re.sub(r"\D+", " ", file.stem).strip())
+    for kind, of_kind in numbers.items():
+        other = next((o for o, its in numbers.items() if o != kind and 2 * len(its & of_kind) > len(of_kind)), None)
+        if other is not None:
+            raise ImportSourceError(
+                f"{files[0].parent}: holds two pictures of each number ({kind}, {other}), so it is no film, and no "
+                "recording of a known format; write colour and depth as a sequence folder (docs/recordings.md), or give "
+                "the pictures of the film a folder of their own"
+            )
+    return files
+
+
+def _pictures_in(folder: Path) -> list[Path]:
     files = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
     return sorted(files, key=lambda file: numeric_order(file.name))
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.nodes.cli.importing import SourceOptions, is_film
 from tests.nodes.support import refused, run, run_process
 from tests.replay import recordings as rec
@@ -36,6 +36,14 @@ def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path)
     cv2.imwrite(str(pictures / "1.jpg"), np.zeros((8, 8, 3), np.uint8))
     assert is_film(pictures)
     assert not is_film(rec.make_folder(tmp_path / "kitchen"))
+    above = tmp_path / "above"
+    shutil.copytree(pictures, above / "images")
+    assert is_film(above)
+    shutil.copytree(pictures, above / "more")
+    assert not is_film(above)
+    shutil.copy(pictures / "1.jpg", pictures / "1.depth.jpg")
+    with pytest.raises(ImportSourceError, match=r"two pictures of each number .*N\.depth\.jpg, N\.jpg"):
+        is_film(pictures)
 
 
 def test_what_is_no_film_is_refused_but_not_before_missing_weights_are(tmp_path: Path) -> None:

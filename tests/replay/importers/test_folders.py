@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ImportSourceError, LogError
+from semantic_mapper.geometry import unproject
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.importers.base import ImportOptions, ImportReport
 from semantic_mapper.replay.importers.kitti360 import LABELS, depth_of_scan
 from semantic_mapper.replay.importers.run import detect_format, import_recording
+from semantic_mapper.replay.importers.seven_scenes import T_COLOR_DEPTH
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics
 from tests.replay import recordings as rec
@@ -370,3 +372,25 @@ def test_a_scan_fills_the_pixels_between_its_beams() -> None:
     row, column = np.nonzero(depth)
     assert (row.min(), row.max(), column.min(), column.max()) == (48, 52, 99, 101) and (depth[row, column] == 5).all()
     assert not depth_of_scan(np.zeros((0, 3)), np.eye(4), camera).any()
+
+
+def test_a_sequence_of_7_scenes_gets_poses_and_depth_of_its_colour_camera(tmp_path: Path) -> None:
+    src = tmp_path / "chess" / "seq-01"
+    src.mkdir(parents=True)
+    u, v = np.meshgrid(np.arange(640), np.arange(480))
+    plane = 2.0 / (1 + 0.2 * (u - 320) / 585 - 0.1 * (v - 240) / 585)  # n @ p = 2 m before the depth camera
+    depth = np.where(u < 20, 65535, np.rint(1000 * plane)).astype(np.uint16)
+    for number in (0, 3):
+        rec.write_image(src / f"frame-{number:06d}.color.png", np.full((480, 640, 3), number, np.uint8))
+        rec.write_image(src / f"frame-{number:06d}.depth.png", depth)
+        np.savetxt(src / f"frame-{number:06d}.pose.txt", rec.pose(number))
+    report, frames = imported(src)
+    assert (report.format, report.frames, [frame.stamp_ns for frame in frames]) == ("7-scenes", 2, [0, 100_000_000])
+    for frame in frames:
+        np.testing.assert_allclose(frame.T_world_camera, rec.pose(frame.seq) @ np.linalg.inv(T_COLOR_DEPTH), atol=1e-12)
+        assert frame.depth_m is not None and not frame.depth_m[:, :10].any()
+        points = unproject(frame.depth_m, frame.intrinsics)[frame.depth_m > 0] - T_COLOR_DEPTH[:3, 3]
+        assert len(points) > 0.7 * 480 * 640 and np.abs(points @ (0.2, -0.1, 1) - 2).max() < 0.003
+    (tmp_path / "chess" / "camera-intrinsics.txt").write_text("585 0 320\n0 585 240\n0 0 1\n")
+    with pytest.raises(ImportSourceError, match="another data set in its layout"):
+        imported(src)
