@@ -87,7 +87,8 @@ def import_(
     log: Path,  # log to write (.mcap)
     options: SourceOptions,
     *,
-    # folder, tum, scannet, replica, 7-scenes, kitti360, rosbag, polycam, record3d, transforms, colmap or opensfm [found out]
+    # folder, tum, scannet, replica, 7-scenes, kitti360, rosbag, polycam, record3d, transforms, colmap, opensfm
+    # [found out]
     format_: str | None = None,
     max_frames: MaxFramesOption = 0,
     every: AtLeastOne = 1,  # only every N-th frame
@@ -153,7 +154,6 @@ def import_source(
     reading = replace(
         reading or ImportOptions(),
         quarters=options.quarters,
-        megapixels=options.megapixels,
         scale=options.recording_scale(),
     )
     with frame_progress("import", None) as bar:

@@ -144,8 +144,8 @@ def pictures_of(folder: Path) -> list[Path]:
         if other is not None:
             raise ImportSourceError(
                 f"{files[0].parent}: holds two pictures of each number ({kind}, {other}), so it is no film, and no "
-                "recording of a known format; write colour and depth as a sequence folder (docs/recordings.md), or give "
-                "the pictures of the film a folder of their own"
+                "recording of a known format; write colour and depth as a sequence folder (docs/recordings.md), or "
+                "give the pictures of the film a folder of their own"
             )
     return files
 

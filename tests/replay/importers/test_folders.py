@@ -394,3 +394,14 @@ def test_a_sequence_of_7_scenes_gets_poses_and_depth_of_its_colour_camera(tmp_pa
     (tmp_path / "chess" / "camera-intrinsics.txt").write_text("585 0 320\n0 585 240\n0 0 1\n")
     with pytest.raises(ImportSourceError, match="another data set in its layout"):
         imported(src)
+
+
+def test_large_pictures_are_made_smaller_with_depth_and_labels_unless_they_shall_stay(tmp_path: Path) -> None:
+    src = rec.make_folder(tmp_path / "kitchen", count=2)
+    (whole,) = imported(src, max_frames=1)[1]
+    report, (frame,) = imported(src, max_frames=1, megapixels=whole.rgb.shape[0] * whole.rgb.shape[1] / 4e6)
+    height, width = whole.rgb.shape[0] // 2, whole.rgb.shape[1] // 2
+    assert frame.rgb.shape == (height, width, 3) and report.info.cameras["camera"] == frame.intrinsics
+    assert frame.depth_m is not None and frame.label is not None
+    assert frame.depth_m.shape == frame.label.shape == (height, width)
+    assert frame.intrinsics.fx == whole.intrinsics.fx / 2 and f"are made {width}x{height}" in " ".join(report.notices)
