@@ -5,9 +5,9 @@ SEMANTIC_MAPPER_TARGET names another machine to build a wheel for: ``x86_64`` or
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
+import runpy
 import shutil
 import subprocess
 import sys
@@ -20,6 +20,7 @@ from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
 SOURCES = ROOT / "semantic_mapper" / "kernels" / "src"
+source_digest = runpy.run_path(str(SOURCES.parent / "digest.py"))["source_digest"]
 GLIBC = "2.28"  # the oldest that the library runs on
 # Name of each library, and the processor it is compiled for. The best one that the processor can run is loaded.
 VARIANTS = {
@@ -38,14 +39,6 @@ def target_machine() -> str:
     return machine
 
 
-def source_digest() -> str:
-    """Digest of all C sources, which the library carries: a test compares both."""
-    digest = hashlib.sha256()
-    for path in sorted(SOURCES.glob("*.[ch]")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
-
-
 def build_kernels(folder: Path, machine: str, sources: Path = SOURCES, headers: tuple[Path, ...] = ()) -> list[Path]:
     """Compile all C of a folder into one shared library a variant; returns the libraries in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,7 +49,7 @@ def build_kernels(folder: Path, machine: str, sources: Path = SOURCES, headers: 
             library = folder / f"{name}.so"
             partial = Path(cache) / library.name
             command = [sys.executable, "-m", "ziglang", "cc", f"--target={machine}-linux-gnu.{GLIBC}"]
-            command += [f"-mcpu={processor}", *FLAGS, f'-DSOURCE_DIGEST="{source_digest()}"', "-o", str(partial)]
+            command += [f"-mcpu={processor}", *FLAGS, f'-DSOURCE_DIGEST="{source_digest(sources)}"', "-o", str(partial)]
             command += [*(f"-I{path}" for path in headers), *map(str, sorted(sources.glob("*.c"))), "-lm"]
             subprocess.run(command, env=environment, check=True)
             beside = library.with_suffix(".new")

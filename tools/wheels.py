@@ -45,7 +45,7 @@ def main() -> None:
     settings = load_setup()
     for machine, libraries in settings.VARIANTS.items():
         wheel = build_wheel(arguments.out, machine)
-        problems = find_problems(wheel, machine, set(libraries), settings.source_digest())
+        problems = find_problems(wheel, machine, set(libraries), settings.source_digest(settings.SOURCES))
         if not problems and machine == platform.machine():
             problems = try_installed(wheel)
         if problems:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import semantic_mapper
 from semantic_mapper.errors import DependencyError, ShapeError
+from semantic_mapper.kernels.digest import source_digest
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -114,13 +115,23 @@ def load_library(folder: Path = LIBRARY_FOLDER) -> ctypes.CDLL:
     for path in (folder / f"{name}.so" for name in (*names, f"kernels-{machine}")):
         if path.exists():
             try:
-                return ctypes.CDLL(str(path))
+                library = ctypes.CDLL(str(path))
             except OSError as error:
                 raise DependencyError(f"cannot load the compiled kernels {path}: {error}") from error
+            _check_sources(library, folder.parent / "src")
+            return library
     raise DependencyError(
         f"no compiled kernels for {machine} in {folder}; in a checkout run `make setup`, otherwise install the package "
         "with pip, which compiles them"
     )
+
+
+def _check_sources(library: ctypes.CDLL, sources: Path) -> None:
+    """Refuse a library whose sources have changed, as a checkout's do by `git pull`: it would answer wrong."""
+    if sources.is_dir() and hasattr(library, "source_digest"):
+        digest = source_digest(sources)
+        if (ctypes.c_char * len(digest)).in_dll(library, "source_digest").value.decode() != digest:
+            raise DependencyError(f"the kernels were compiled from other sources than {sources}: run `make setup`")
 
 
 def has_avx2() -> bool:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib
-import importlib.util
 import pkgutil
 import re
+import shutil
 from pathlib import Path
-from types import ModuleType
+
+import pytest
 
 import semantic_mapper
+from semantic_mapper.errors import DependencyError
 from semantic_mapper.kernels import binding
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,18 +19,15 @@ SOURCES = ROOT / "semantic_mapper" / "kernels" / "src"
 ONLY_TESTED = {"count_visits", "sum_arguments"}
 
 
-def load_setup() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("project_setup", ROOT / "setup.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_library_was_compiled_from_these_sources() -> None:
-    expected = load_setup().source_digest()
-    compiled = (ctypes.c_char * len(expected)).in_dll(binding.load_library(), "source_digest").value.decode()
-    assert compiled == expected, "the kernels were compiled from other sources: run `make setup`"
+def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
+    shutil.copytree(binding.LIBRARY_FOLDER, tmp_path / "lib")
+    shutil.copytree(SOURCES, tmp_path / "src")
+    binding.load_library(tmp_path / "lib")
+    binding.load_library.cache_clear()
+    with (tmp_path / "src" / "surface.c").open("a") as changed:
+        changed.write("\n")
+    with pytest.raises(DependencyError, match="compiled from other sources"):
+        binding.load_library(tmp_path / "lib")
 
 
 def declarations() -> dict[str, list[binding.Kernel]]:
