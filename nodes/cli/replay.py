@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -40,13 +41,14 @@ def replay(
     mapper: MapperSettings,
     options: FilmSourceOptions,
     *,
-    out: Path,  # folder for the results; made if missing
+    out: Path | None = None,  # folder for the results; made if missing [runs/NAME]
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
     rerun: Path | None = None,  # also write a Rerun recording (.rrd)
     # corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end
     corrections: Path | None = None,
     accept_contradictions: bool = False,  # exit code 0 in place of 3
+    open_: bool = False,  # show the report in a browser at the end
 ) -> int:
     """Map a recording: a log, a film, or a folder or bag that `import` takes.
 
@@ -57,6 +59,7 @@ def replay(
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
     Where poses and depth contradict each other, the map is written and the exit code is 3.
 
+    Example: semantic-mapper replay path/to/redkitchen --open
     Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
     Example: semantic-mapper replay film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
@@ -65,6 +68,7 @@ def replay(
     from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
+    out = out or Path("runs") / source[0].resolve().stem
     if not is_log(source[0]):
         if len(source) > 1:
             raise typer.BadParameter("of several sources each has to be a part of one log", param_hint="SOURCE")
@@ -83,6 +87,8 @@ def replay(
             )
         show_replay(output, summary, out)
         output.json(summary)
+        if open_:
+            webbrowser.open((out / "report.html").resolve().as_uri())
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         untrusted = dig(summary, "pose_check.warning") and not accept_contradictions

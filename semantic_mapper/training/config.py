@@ -87,7 +87,7 @@ class FinetuneConfig(Config, frozen=True):
     frozen_encoder_fraction: Fraction = 0.0
     # Of the budget behind that: steps on single images, where a kind classifies these; the rest is on rays
     image_fraction: Fraction = 0.75
-    seed: NotNegative = 0
+    seed: NotNegative = 0  # of everything that is drawn at random
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
     grid: GridFitConfig = GridFitConfig()
