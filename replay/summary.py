@@ -73,6 +73,29 @@ def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
     return figures_table("replay", summaries, _ROWS, _ROWS_BY_NAME)
 
 
+def headlines(summary: Mapping[str, Any]) -> list[str]:
+    """What became of a run, in a few lines; the report has the table."""
+    frames, scored = summary["frames"], dig(summary, "metrics.miou")
+    unsure = "".join(
+        f", {percent(fraction)} {what}"
+        for path, what in (("map.unknown", "of an unknown class"), ("map.computed", "computed, not measured"))
+        if (fraction := dig(summary, path))
+    )
+    lines = [
+        f"{frames['fused']} of {counted(frames['published'], 'frame')} of {summary['source']} mapped by the weights "
+        f"{dig(summary, 'weights.file')}",
+        f"{dig(summary, 'map.surface_points'):,} surface points in voxels of {_voxel_size(summary)}{unsure}",
+    ]
+    if (disagreement := dig(summary, "pose_check.depth_disagreement")) is not None:
+        lines.append(f"poses and depth disagree in {percent(disagreement)} of what two frames see")
+    if scored is not None:
+        lines.append(f"{percent(scored)} mIoU, {percent(dig(summary, 'metrics.total_accuracy'))} of the pixels right")
+    if (ms := dig(summary, "latency_ms.p50")) is not None:
+        memory = dig(summary, "map.memory_mb")
+        lines.append(f"{_ms(ms)} a frame (p95 {_ms(dig(summary, 'latency_ms.p95'))}), the map {memory} MB")
+    return lines
+
+
 def result_lines(out: Path) -> list[str]:
     """Where the results are."""
     return [f"  {out / name}  ({text})" for name, text in _RESULTS.items() if (out / name).exists()]

@@ -24,7 +24,7 @@ from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log, prepare_folder
-from semantic_mapper.replay.summary import dig, notes, result_lines, summary_table
+from semantic_mapper.replay.summary import dig, headlines, notes, result_lines
 
 
 class FilmSourceOptions(SourceOptions, frozen=True):
@@ -125,6 +125,6 @@ def demo(
 
 
 def show_replay(output: Output, summary: Mapping[str, Any], out: Path) -> None:
-    """Table, notes and files of one replay, for people."""
-    for part in (summary_table({out.name: summary}), *notes(summary), *result_lines(out)):
+    """What became of one replay, notes and files, for people."""
+    for part in (*headlines(summary), *notes(summary), *result_lines(out)):
         output.print(part)

@@ -38,7 +38,7 @@ T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.0308], [0, 1, 0, 0.0042], [0, 0, 1, 0.0
 
 
 def open_seven_scenes(folder: Path, options: ImportOptions) -> PosedPictures:
-    """A sequence, opened; one frame for each colour image. Raises ImportSourceError: there is none with a pose."""
+    """A sequence, opened; one frame for each colour image. Raises ImportSourceError: none has a pose."""
     for file in (place / name for place in (folder, folder.parent) for name in _CALIBRATIONS):
         if file.exists():
             raise ImportSourceError(

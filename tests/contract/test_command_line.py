@@ -69,7 +69,7 @@ COMMANDS: dict[str, str] = {
     "keys forget": "keys forget robot --keys {tmp}/keys",
     "keys forget nobody": "keys forget robot --keys {tmp}/keys",
     "keys show where there are none": "keys show --keys {tmp}/none",
-    "replay without a folder": "replay {log}",
+    "finetune without a file": "finetune {log} --keyframes 2",
     "replay nothing": "replay {tmp}/none.mcap --out {tmp}/run",
     "replay with missing weights": "replay {log} --out {tmp}/run --weights {tmp}/none.safetensors",
     "replay with voxels of fifty metres": "replay {log} --out {tmp}/run --voxel-size 50",
@@ -196,7 +196,7 @@ def test_a_verb_takes_what_it_took(verb: str) -> None:
     assert verbs()[verb] == _GOLDEN["verbs"][verb]
 
 
-_MIDDLE = list(COMMANDS).index("replay without a folder")  # no command behind it needs a file of one before it
+_MIDDLE = list(COMMANDS).index("finetune without a file")  # no command behind it needs a file of one before it
 
 
 @pytest.mark.parametrize("names", [list(COMMANDS)[:_MIDDLE], list(COMMANDS)[_MIDDLE:]], ids=["first", "second"])
