@@ -101,7 +101,8 @@ def test_the_readme_maps_a_log(tmp_path: Path) -> None:
     from tests.contract.golden import LOG, REFUSED_SEQ, WEIGHTS
 
     text = next(block for block in _BLOCK.findall((api.REPOSITORY / "README.md").read_text()) if "Mapper.load" in block)
-    text = text.replace('"kitchen.safetensors"', repr(str(WEIGHTS))).replace('"kitchen.mcap"', repr(str(LOG)))
+    text = text.replace('"kitchen.safetensors"', repr(str(WEIGHTS)))
+    text = text.replace('"runs/kitchen/kitchen.mcap"', repr(str(LOG)))
     text = text.replace("for frame in log:", f"for frame in (f for f in log if f.seq < {REFUSED_SEQ - 3}):")
     known: dict[str, Any] = {}
     exec(compile(text, "README.md", "exec"), known)
