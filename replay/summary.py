@@ -88,6 +88,8 @@ def headlines(summary: Mapping[str, Any]) -> list[str]:
     ]
     if (disagreement := dig(summary, "pose_check.depth_disagreement")) is not None:
         lines.append(f"poses and depth disagree in {percent(disagreement)} of what two frames see")
+    if scene := summary.get("scene"):
+        lines.append(f"known to the weights: {_scene_known(scene)}")
     if scored is not None:
         lines.append(f"{percent(scored)} mIoU, {percent(dig(summary, 'metrics.total_accuracy'))} of the pixels right")
     if (ms := dig(summary, "latency_ms.p50")) is not None:

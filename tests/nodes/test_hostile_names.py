@@ -54,7 +54,8 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(hostile: Path, config: Path) -> Path:
     out = hostile / "run"
     options = ("--out", out, "--weights", hostile / "tiny.safetensors", "--config", config)
-    said = plain_text_of("replay", hostile / "log.mcap", *options)
+    assert r"log [/b]\x1b[2J" in plain_text_of("replay", hostile / "log.mcap", *options)
+    said = plain_text_of("eval", out)
     assert "IoU [/b]" in said and "IoU [bold]x" in said
     return out
 
