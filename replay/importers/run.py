@@ -108,11 +108,12 @@ def detect_format(src: Path) -> str:
 
 
 def is_recording(src: Path) -> bool:
-    """Whether a folder is, or holds, a recording of one of the formats."""
+    """Whether a folder is, or holds, a recording of one of the formats, or one that nearly is and gets advice."""
     try:
         detect_format(src)
     except ImportSourceError:
-        return any(_by_marks(folder) is not None for folder in src.iterdir() if folder.is_dir())
+        nearly = any((src / name).exists() for name in _FOLDERS if name != "database.db")  # pictures, still
+        return nearly or any(_by_marks(folder) is not None for folder in src.iterdir() if folder.is_dir())
     return True
 
 

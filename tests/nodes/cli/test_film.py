@@ -39,6 +39,9 @@ def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path)
     above = tmp_path / "above"
     shutil.copytree(pictures, above / "images")
     assert is_film(above)
+    (above / "traj.txt").touch()
+    assert not is_film(above), "as NICE-SLAM renders rooms, which gets advice"
+    (above / "traj.txt").unlink()
     shutil.copytree(pictures, above / "more")
     assert not is_film(above)
     shutil.copy(pictures / "1.jpg", pictures / "1.depth.jpg")
