@@ -1,4 +1,4 @@
-"""A headless Chromium that is told what to do over a pipe, from Debian's packages, without root.
+"""A headless Chromium that takes commands over a pipe, from Debian's packages, without root.
 
 The packages are unpacked into ``.tools/chromium`` (100 MB to fetch, 300 MB unpacked) and run from there. WebGL is
 rendered by the CPU (SwiftShader). The browser reaches this machine alone: every other name resolves to nothing.

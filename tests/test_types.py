@@ -92,7 +92,7 @@ def test_intrinsics_that_no_camera_has_are_refused(change: dict[str, float]) -> 
     ],
 )
 def test_unusual_but_real_cameras_are_accepted(change: dict[str, float]) -> None:
-    dataclasses.replace(VGA, **change)
+    assert dataclasses.replace(VGA, **change) != VGA
 
 
 def test_normalised_intrinsics_are_named_and_the_pixels_given() -> None:
@@ -113,4 +113,4 @@ def test_a_number_out_of_its_range_is_refused_by_name(name: str, value: float) -
 def test_intrinsics_on_the_bound_stay_within_it_when_resized(width: int) -> None:
     widest = CameraIntrinsics(0.1 * width, 0.1 * 480, width / 2, 240, width, 480)
     for small in range(8, width + 1, 7):
-        scale_intrinsics(widest, small, 96)
+        assert scale_intrinsics(widest, small, 96).width == small

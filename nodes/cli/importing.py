@@ -151,11 +151,7 @@ def import_source(
     if format_name is None and is_film(source):
         _import_film(output, source, log, options.film_options(), overwrite=overwrite)
         return 0
-    reading = replace(
-        reading or ImportOptions(),
-        quarters=options.quarters,
-        scale=options.recording_scale(),
-    )
+    reading = replace(reading or ImportOptions(), quarters=options.quarters, scale=options.recording_scale())
     with frame_progress("import", None) as bar:
 
         def on_progress(done: int, total: int) -> None:

@@ -133,9 +133,10 @@ def pictures_of(folder: Path) -> list[Path]:
 
     Raises ImportSourceError: they are of several kinds, as colour and depth are, which no film is.
     """
-    places = {place: _pictures_in(place) for place in (folder, *sorted(p for p in folder.iterdir() if p.is_dir()))}
-    filled = [files for files in places.values() if files]
-    files = places[folder] or (filled[0] if len(filled) == 1 else [])
+    files = _pictures_in(folder)
+    if not files:
+        below = [found for place in folder.iterdir() if place.is_dir() and (found := _pictures_in(place))]
+        files = below[0] if len(below) == 1 else []
     numbers: dict[str, set[str]] = {}
     for file in files:
         numbers.setdefault(re.sub(r"\d+", "N", file.name), set()).add(re.sub(r"\D+", " ", file.stem).strip())

@@ -148,7 +148,7 @@ def _step(pipeline: MappingPipeline, frame: PosedFrame) -> RoomLook:
 
 
 def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
-    """Ids of another label set as those of ``ROOMS`` with the same name; its ignore id where there is none."""
+    """Ids of another label set as those of ``ROOMS`` with the same name; its ignore id for other names."""
     return ROOMS.to_ids(ROOMS.channel_map_from(label_set)[label])
 
 

@@ -33,7 +33,7 @@ class RecordStore:
             self._read()
 
     def find(self, kind: type[RecordT], settings: str, weights: str, room: int) -> RecordT | None:
-        """The record of a room made with these settings by these weights; None where there is none yet."""
+        """The record of a room made with these settings by these weights; None where it has not been made."""
         record = self._records.get((settings, weights, room))
         return record if isinstance(record, kind) else None
 

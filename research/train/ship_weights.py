@@ -142,7 +142,7 @@ def ship(half: Path, tables: Sequence[Path], out: Path, card: Path) -> None:
 def ship_on_base(half: Path, out: Path) -> None:
     """Write weights to ``out`` without the tensors that the default weights hold alike, naming those as their base.
 
-    Ship them anew whenever the default weights change. Raises WeightsError: unreadable, or of a run that nobody can do
+    Ship them again whenever the default weights change. Raises WeightsError: unreadable, or of a run that nobody can do
     again.
     """
     check_chain(half, load_checkpoint(half).recipe)

@@ -126,7 +126,7 @@ def _rerun_rows(path: Path) -> dict[str, int]:
 
 
 def look_at_rrd(folder: Path) -> dict[str, Any]:
-    """Entities of a map's and of a log's recording, and how often each was told."""
+    """Entities of a map's and of a log's recording, and how often each was logged."""
     return {"map": _rerun_rows(export(MAP, folder / "map.rrd")), "log": _rerun_rows(export(LOG, folder / "log.rrd"))}
 
 

@@ -1,4 +1,4 @@
-"""Kernels on several threads: each iteration runs once, whoever calls, and torch's threads leave them the cores."""
+"""Kernels on several threads: each iteration runs once, from any caller, and torch's threads leave them the cores."""
 
 from __future__ import annotations
 

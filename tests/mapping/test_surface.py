@@ -128,7 +128,7 @@ def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:
         buffers = GridBuffers(*(np.ascontiguousarray(values[rows]) for values in grid.buffers()))
 
     def field(z: float, direction: np.ndarray) -> float:
-        """TSDF at z of a ray, interpolated over the observed voxels; NaN where there is none."""
+        """TSDF at z of a ray, interpolated over the observed voxels; NaN without any."""
         around = [(f, at) for f, at in corners(buffers, (pose[:3, 3] + z * direction) / 0.02) if buffers.weight[at] > 0]
         fraction = sum(f for f, _ in around)
         return sum(f * float(buffers.tsdf[at]) for f, at in around) / fraction if fraction else np.nan

@@ -26,7 +26,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def status(port: int, request: bytes) -> bytes:
-    """The first line of an answer; empty where there is none."""
+    """The first line of an answer; empty without an answer."""
     with socket.create_connection(("127.0.0.1", port), 30) as client:
         client.sendall(request + b"\r\nHost: localhost\r\nConnection: close\r\n\r\n")
         return client.makefile("rb").readline().strip()

@@ -1,4 +1,4 @@
-"""Questions and answers as bytes: exact round trips, and an error for whatever is none."""
+"""Questions and answers as bytes: exact round trips, and an error for anything else."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def strange_publisher(endpoint: str, kind: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def take_subscriptions(other: Any) -> None:
-    """To the topic, and to the handshake; cut connections are told in between."""
+    """To the topic, and to the handshake; cut connections are reported in between."""
     subscriptions = 0
     while subscriptions < 2:
         assert other.poll(WAIT_S * 1e3)

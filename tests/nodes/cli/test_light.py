@@ -13,7 +13,7 @@ from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.queries.scene import whole_map
 
 HEAVY = ("torch", "open3d", "ray", "rerun", "depthai", "gtsam", "matplotlib", "pandas")
-# Runs uses of the command one after the other; the package that one loads is told of it and of those behind it.
+# Runs uses of the command one after the other; a package that one loads counts for it and for those behind it.
 PROGRAM = """
 import json, sys
 from semantic_mapper.nodes.cli.main import main

@@ -1,4 +1,4 @@
-"""Where there is no systemd, and the unit file; what systemd is told: tests/nodes/test_faults.py."""
+"""Where there is no systemd, and the unit file; what systemd receives: tests/nodes/test_faults.py."""
 
 from __future__ import annotations
 

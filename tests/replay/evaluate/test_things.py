@@ -28,7 +28,7 @@ def log_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def voxel_map() -> VoxelMap:
-    """Of true classes: what it lacks is due to voxels and to how things are told apart."""
+    """Of true classes: what it lacks is due to voxels and to how things are separated."""
     made = VoxelMap(tiny_config().voxel_map, ROOMS)
     for view in VIEWS:
         channel = ROOMS.to_channels(view.rendered.label)

@@ -71,7 +71,7 @@ def test_poses_between_two_transforms_are_interpolated_and_beyond_them_there_are
         return T
 
     def change(m: Messages, events: list[Event]) -> list[Event]:
-        """Odometry turns and moves evenly, and is told 30 ms off the images; the last image comes after its end."""
+        """Odometry turns and moves evenly, and is sent 30 ms off the images; the last image comes after its end."""
         times = [bags.stamp_of(k) + 30 * MS for k in range(-1, 6)]
         return [*without("/tf")(m, events), *(("/tf", ns, m.tf(ns, "odom", "base_link", even(ns))) for ns in times)]
 

@@ -169,7 +169,7 @@ def test_a_damaged_frame_is_named_by_number_and_offset(small_log: Path) -> None:
         assert len(reader) == FRAMES
         assert seqs(reader) == [s for s in range(FRAMES) if s != 4]
         assert seqs(reader) == [s for s in range(FRAMES) if s != 4]
-        assert len(reader.errors) == 1, "each error is told once"
+        assert len(reader.errors) == 1, "each error is reported once"
         assert f"frame 4 at byte {offset}" in str(reader.errors[0]) and "crc" in str(reader.errors[0])
         with pytest.raises(LogError, match="frame 4 at byte"):
             reader.frame(4)
