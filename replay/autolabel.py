@@ -1,4 +1,4 @@
-"""Weights label a log: every frame is rendered as ``replay`` renders it, and a new log holds what was rendered.
+"""Weights label a log: every frame is rendered as ``map`` renders it, and a new log holds what was rendered.
 
 All else stays as it is, byte for byte: colour images, poses, stamps, other topics, attachments, the cut into parts.
 What was rendered is marked in each frame (``PosedFrame.label_is_pseudo``, ``depth_sigma_m``), and a note says by whom.
@@ -73,7 +73,7 @@ class AutolabelReport(NamedTuple):
 def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) -> AutolabelReport:
     """Write a new log with labels that weights have rendered; it is there once it is whole.
 
-    Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
+    Source views of a frame are those that ``map`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
     ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Nothing is left of the new log, nor
     of images of things, where this raises ConfigError: the new log would lie among the parts of the old one.

@@ -221,7 +221,7 @@ def compute_depths(
     """What was computed of each frame without a sensor's depth, by its camera and stamp.
 
     Frames whose pictures nothing can be computed from (dark, blurred, standing still) are left out, with a line in the
-    log. No map gives hints, so depth is a little less exact than in ``replay``. ``config.source`` is "auto" or
+    log. No map gives hints, so depth is a little less exact than in ``map``. ``config.source`` is "auto" or
     "computed"; ``on_frame`` is called with the number of frames that are read."""
 
     def no_hint(_: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, np.ndarray]:

@@ -91,11 +91,11 @@ def map_path(path: Path) -> Path:
     if path.is_dir() and (path / MAP_NAME).is_file():
         return path / MAP_NAME
     if is_log(path):
-        raise ConfigError(f"{path}: is a log; `semantic-mapper replay {path} --out FOLDER` makes a map of it")
+        raise ConfigError(f"{path}: is a log; `semantic-mapper map {path} --out FOLDER` makes a map of it")
     if not path.is_dir():
         return path
     maps = [*sorted(path.glob(f"*{MAP_SUFFIX}")), *sorted(path.glob(f"*/{MAP_NAME}"))]
-    hint = f"name the map itself, such as {maps[0]}" if maps else "give a saved map or a folder of `replay`"
+    hint = f"name the map itself, such as {maps[0]}" if maps else "give a saved map or a folder of `map`"
     if (path / STORE_MARK).is_file():
         hint = "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
     raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {hint}")

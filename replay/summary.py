@@ -25,7 +25,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
         summary = json.loads(read_regular(path, MAX_SUMMARY_BYTES))
     except (OSError, ValueError, RecursionError, ConfigError) as error:
         raise ConfigError(
-            f"{path}: cannot be read; give a folder that `semantic-mapper replay` has written ({error})"
+            f"{path}: cannot be read; give a folder that `semantic-mapper map` has written ({error})"
         ) from error
     if not isinstance(summary, dict) or "frames" not in summary or "metrics" not in summary:
         raise ConfigError(f"{path}: is not the summary of a replay")
@@ -70,7 +70,7 @@ def figures_table(
 
 def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
     """One column a summary, by name."""
-    return figures_table("replay", summaries, _ROWS, _ROWS_BY_NAME)
+    return figures_table("map", summaries, _ROWS, _ROWS_BY_NAME)
 
 
 def headlines(summary: Mapping[str, Any]) -> list[str]:

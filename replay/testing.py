@@ -31,7 +31,7 @@ Quality = Literal["fast", "balanced", "reference"] | None
 class ReplayedMap:
     """The map that a log has become, and the questions of tests to it. Points are (3,) metres in the world."""
 
-    folder: Path  # what ``semantic-mapper replay`` would have written: map, picture, summary
+    folder: Path  # what ``semantic-mapper map`` would have written: map, picture, summary
     voxel_map: VoxelMap
     summary: Mapping[str, Any]  # as in ``summary.json``
     root: Path  # what paths of stored runs are relative to
@@ -141,7 +141,7 @@ class LogReplays:
         quality: Quality = None,
         max_frames: int = 0,
     ) -> ReplayedMap:
-        """Replay a log (.mcap) through ``MappingPipeline.step``, as ``semantic-mapper replay`` does: by weights, None =
+        """Replay a log (.mcap) through ``MappingPipeline.step``, as ``semantic-mapper map`` does: by weights, None =
         those that ship, and a config of the mapper, a TOML file or its sections as a dict; ``max_frames`` 0 means all.
 
         Raises LogError: the log cannot be read, or none of its frames can be mapped. WeightsError, ConfigError,

@@ -37,7 +37,7 @@ VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
             "pip install 'semantic-mapper[sfm]'",
         ),
         (TRY.format("import semantic_mapper.nodes.foxglove.server"), "pip install 'semantic-mapper[foxglove]'"),
-        (VERB.format(["fleet", "run", "replay", __file__, "--out", "none"]), 'pip install "semantic-mapper[fleet]"'),
+        (VERB.format(["fleet", "run", "map", __file__, "--out", "none"]), 'pip install "semantic-mapper[fleet]"'),
         (VERB.format(["fleet", "table", "none"]), 'pip install "semantic-mapper[fleet]"'),
     ],
 )

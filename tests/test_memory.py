@@ -27,7 +27,7 @@ def test_a_lack_of_memory_is_known_by_its_words(error: BaseException, is_shortag
 
 
 def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
-    limited = f"ulimit -v 1500000; exec '{COMMAND}' replay {__file__} --out none"
+    limited = f"ulimit -v 1500000; exec '{COMMAND}' map {__file__} --out none"
     done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     line = error_line(done.stderr)

@@ -35,7 +35,7 @@ _CAMERAS: dict[str, type[msgspec.Struct]] = {
     for kind in ("v4l2", "opencv", "stereo", "oak", "realsense")
 }
 PAGES: dict[str, tuple[str, type[msgspec.Struct]]] = {
-    "The mapper": ("`--config` and `--set` of `replay`, `eval`, `demo`; `config` of a mapper node", MapperConfig),
+    "The mapper": ("`--config` and `--set` of `map`, `eval`, `demo`; `config` of a mapper node", MapperConfig),
     "Finetuning": ("`--config` and `--set` of `finetune`", FinetuneConfig),
     "Learning next to a mapper": ("`config` of a finetuner node", OnlineConfig),
     "A launch file": ("its top level; `[[node]]` tables hold the options below", LaunchFile),

@@ -32,9 +32,9 @@ def autolabel(
 ) -> None:
     """Label every frame of a log with weights, into a new log.
 
-    A frame is rendered as `replay` and `eval` render it. All else of the log stays: images, poses, stamps, other
+    A frame is rendered as `map` and `eval` render it. All else of the log stays: images, poses, stamps, other
     topics, files that it holds, parts. Such pseudo labels, and such depth, are marked: `finetune` learns from them,
-    `eval` and `replay` never score on them, and computed depth counts as in `replay`. Labels that are there stay; those
+    `eval` and `map` never score on them, and computed depth counts as in `map`. Labels that are there stay; those
     of an earlier autolabel are replaced. Ctrl-C leaves nothing (exit code 130).
 
     Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap

@@ -17,7 +17,7 @@ _DEFAULT = Tolerances()
 @verb
 def compare(
     output: JsonOutput,
-    a: Path,  # folder that `replay` or `up` has written, or a map.npz
+    a: Path,  # folder that `map` or `up` has written, or a map.npz
     b: Path,  # another one
     *,
     score: AtLeastZero = _DEFAULT.score,  # allowed of mIoU and accuracies

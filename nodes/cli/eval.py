@@ -32,7 +32,7 @@ from semantic_mapper.replay.summary import notes, percent, read_summary, result_
 def evaluate(
     output: JsonOutput,
     mapper: MapperSettings,
-    # Folders of `replay`; logs, or folders with their parts
+    # Folders of `map`; logs, or folders with their parts
     targets: Annotated[list[Path], typer.Argument(metavar="DIR_OR_LOG...")],
     *,
     weights: WeightsOption = None,
@@ -62,7 +62,7 @@ def evaluate(
     folders = [t for t in targets if t not in logs]
     refuse_options(
         (baselines and seconds == 0, "--seconds", "the U-Net needs time to learn"),
-        (mesh is not None and not folders, "--mesh", "goes with a DIR that `replay` has written"),
+        (mesh is not None and not folders, "--mesh", "goes with a DIR that `map` has written"),
         (instances is not None and not logs, "--instances", "goes with a LOG"),
     )
     path = out or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))

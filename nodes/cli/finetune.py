@@ -39,14 +39,14 @@ def finetune(
     # panoptic: pseudo labels, NNNNNN.png or weights, in place of the log's
     pseudo: Annotated[str | None, typer.Option(metavar="DIR|WEIGHTS")] = None,
     uncovered: Literal["stuff", "empty"] = "stuff",  # panoptic: what is outside of all boxes
-    depth: DepthSource = "sensor",  # as of `replay`
+    depth: DepthSource = "sensor",  # as of `map`
     # label images NNNNNN.png in place of the log's (`label --serve`); all of them without --keyframes
     labels: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     strokes: bool = False,  # labels are strokes: let each grow
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
-    The keyframes are those that together show most of what the log shows; no other label is trained on, and `replay`
+    The keyframes are those that together show most of what the log shows; no other label is trained on, and `map`
     and `eval` never score on them. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors

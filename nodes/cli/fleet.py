@@ -30,7 +30,7 @@ MAX_LOGS = 40
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
+    help="Map, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
 )
 
 
@@ -38,7 +38,7 @@ app = typer.Typer(
 @verb
 def run(
     output: JsonOutput,
-    operation: Literal["replay", "eval", "autolabel", "finetune", "refine"],  # as the verb
+    operation: Literal["map", "eval", "autolabel", "finetune", "refine"],  # as the verb
     # paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are tags). refine: maps
     # (.npz)
     logs: list[str],
@@ -58,9 +58,9 @@ def run(
     done again, so that the same command continues a run that was stopped or killed, and tries failed logs again. The
     exit code is 1 where logs failed. Ctrl-C ends the tasks that run (exit code 130).
 
-    Example: semantic-mapper fleet run replay "logs/*.mcap" --out runs/fleet
+    Example: semantic-mapper fleet run map "logs/*.mcap" --out runs/fleet
     Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week --address head:6379
-    Example: semantic-mapper fleet run replay "logs/*.mcap" --out runs/fleet --set voxel_map.voxel_size_m=0.05
+    Example: semantic-mapper fleet run map "logs/*.mcap" --out runs/fleet --set voxel_map.voxel_size_m=0.05
     """
     inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
     from semantic_mapper.nodes.fleet.run import OPERATIONS, make_task, run_fleet

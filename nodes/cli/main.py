@@ -15,8 +15,8 @@ from semantic_mapper.nodes.cli.verb import Settings
 _MODULES = "semantic_mapper.nodes.cli"
 # By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
 VERBS: Mapping[str, tuple[str, str]] = {
-    "demo": ("replay:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
-    "replay": ("replay:replay", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
+    "demo": ("mapping:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
+    "map": ("mapping:map_", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
     "compare": ("compare:compare", "Compare two runs of one log: counts, scores, and how far the maps are apart."),
     "up": ("up:up", "Start the nodes of a launch file as processes and watch over them until they end."),
     "view": ("view:view", "Show a running launch, a log or a saved map in a browser, until Ctrl-C."),
@@ -36,7 +36,7 @@ VERBS: Mapping[str, tuple[str, str]] = {
         "Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML.",
     ),
     "bench": ("bench:bench", "Measure speed on this machine, on frames of 640x480."),
-    "fleet": ("fleet:app", "Replay, score, label, finetune and merge many logs, on this machine or a Ray cluster."),
+    "fleet": ("fleet:app", "Map, score, label, finetune and merge many logs, on this machine or a Ray cluster."),
     "keys": ("keys:keys", "Make, show or exchange the keys by which machines know each other."),
     "doctor": ("doctor:doctor", "Look for what this machine lacks, with a fix for each thing; or list its cameras."),
 }
@@ -98,9 +98,9 @@ def _options(
 ) -> None:
     """Posed camera frames in, live semantic 3D map out.
 
-    Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper replay --help`. Results go to
+    Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper map --help`. Results go to
     stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 3 a map that
-    cannot be trusted (`replay`), 130 Ctrl-C.
+    cannot be trusted (`map`), 130 Ctrl-C.
     """
     Settings.verbose = verbose
 

@@ -182,7 +182,7 @@ def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str
     if not endpoint:
         raise ConfigError(
             f"{source}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
-            f"`semantic-mapper replay LOG --corrections {file} --out FOLDER`"
+            f"`semantic-mapper map LOG --corrections {file} --out FOLDER`"
         )
     trajectory = read_corrections(file)
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)

@@ -98,7 +98,7 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
     for argument in arguments:
         if not argument.endswith(MAP_SUFFIX) and is_store(argument):
             store = Store(argument)
-            replays = sorted((r for r in store.results() if r.operation == "replay"), key=lambda r: r.finished_ns)
+            replays = sorted((r for r in store.results() if r.operation == "map"), key=lambda r: r.finished_ns)
             latest = {result.log_digest: result for result in replays}.values()
             found += sorted((_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}") for r in latest)
             continue

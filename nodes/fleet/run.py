@@ -374,7 +374,7 @@ def code_version() -> str:
 
 
 class LogSettings(MapperConfig, frozen=True):
-    """Of ``replay`` and ``eval``: those of the mapper, and ``max_frames`` (0 = all)."""
+    """Of ``map`` and ``eval``: those of the mapper, and ``max_frames`` (0 = all)."""
 
     max_frames: NotNegative = 0
 
@@ -414,7 +414,7 @@ class Operation:
     defaults: Mapping[str, Any] = field(default_factory=dict[str, Any])  # settings that differ from those of the kind
 
 
-def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
+def _map(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
     summary, session = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
@@ -425,7 +425,7 @@ def _replay(log: Path, out: Path, weights: Path | None, settings: LogSettings) -
     events += [("damaged", text) for text in summary["damaged_stretches"]]
     events += [("refused", f"frame {r['seq']}: {r['reason']}") for r in summary["refusals"]]
     costs["map_memory_mb"] = summary["map"]["memory_mb"]
-    scores = _scores("replay", dig(summary, "metrics.per_class") or {}, session.segments)
+    scores = _scores("map", dig(summary, "metrics.per_class") or {}, session.segments)
     return Findings(metrics=metrics, costs=costs, scores=(scores,), events=tuple(events[:_MAX_EVENTS]))
 
 
@@ -479,7 +479,7 @@ def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings
 
 
 OPERATIONS: Mapping[str, Operation] = {
-    "replay": Operation(LogSettings, _replay, defaults=OFFLINE),
+    "map": Operation(LogSettings, _map, defaults=OFFLINE),
     "eval": Operation(LogSettings, _eval),
     "autolabel": Operation(AutolabelSettings, _autolabel, defaults=OFFLINE),
     "finetune": Operation(FinetuneSettings, _finetune, memory_gb=4.0),

@@ -43,7 +43,7 @@ class MissingError(StoreError):
 class MethodScores(msgspec.Struct, frozen=True):
     """How well one method labelled a log."""
 
-    method: str  # "replay", or a method of ``eval`` such as "sray" or "own image alone"
+    method: str  # "map", or a method of ``eval`` such as "sray" or "own image alone"
     iou: dict[str, float | None]  # intersection over union, 0..1, by class
     names: tuple[str, ...] = ()  # L names of classes of ``stretches``
     # (S, 3, L) pixels of S stretches of consecutive scored frames, which comparisons draw again: by class hits, truth,
@@ -69,7 +69,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     # digest of all that decides a result: operation, content of the log, weights, settings, code. Of a failure: of
     # operation, URL, weights and settings.
     key: str
-    operation: str  # "replay", "eval", "autolabel", "finetune" or "refine"
+    operation: str  # "map", "eval", "autolabel", "finetune" or "refine"
     log: str  # URL of the log, without credentials
     tags: dict[str, str]  # of the manifest, such as robot, site and date
     version: str  # of the code, for people
@@ -304,7 +304,7 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
     """Every log that is meant, once each, in the order of the arguments.
 
     A glob stands for the files that it matches (``site/*.mcap``) or, with a slash at its end, for folders
-    (``site/*/``); a folder is the parts of one recording, as for ``replay``. A manifest is CSV with a column ``log``
+    (``site/*/``); a folder is the parts of one recording, as for ``map``. A manifest is CSV with a column ``log``
     (relative paths count from the manifest) and any others, which become tags. Whether a log can be read is found out
     by its task. Raises ConfigError: a glob matches nothing, a path is missing, a manifest cannot be used, or there is
     no log at all. StoreError: something cannot be reached.

@@ -56,7 +56,7 @@ _MARKS = {
 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
-_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper replay` find them"
+_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),

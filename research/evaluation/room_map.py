@@ -133,7 +133,7 @@ def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -
 
 
 def _depth(suite: SuiteConfig) -> DepthConfig:
-    """Where the mapper takes depth from: computed as in ``replay``, and by the field where no frame has any."""
+    """Where the mapper takes depth from: computed as in ``map``, and by the field where no frame has any."""
     config = suite.mapper.depth
     if suite.depth == "computed":
         waits = msgspec.structs.replace(config.from_motion, delay_frames=DELAY_FRAMES)

@@ -3,7 +3,7 @@
 The film is made here: of the pictures of a sequence folder (with its poses as truth), or of a rendered walk through a
 ROOMS room, with auto exposure and, with ``--rolling-shutter``, rows that are read one after the other.
 
-``aligned.mcap`` is the log of the film in the world and the metres of the true poses: what ``replay`` makes of it can
+``aligned.mcap`` is the log of the film in the world and the metres of the true poses: what ``map`` makes of it can
 be compared with a mesh.
 
 Example: python -m research.experiments.video path/to/redkitchen --focal-error 0.1 --out runs/video

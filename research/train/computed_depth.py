@@ -13,7 +13,7 @@ from semantic_mapper.depth_from_motion.stream import DepthFromMotion
 from semantic_mapper.types import PosedFrame
 
 BETWEEN_M = 0.12  # way between two pictures at most: views farther apart get others in between, as a video has them
-DELAY_FRAMES = 6  # that half of the rooms' frames wait for later ones, as in ``replay``; the others are as if live
+DELAY_FRAMES = 6  # that half of the rooms' frames wait for later ones, as in ``map``; the others are as if live
 _STREAM = 11  # number of the random stream; rooms, paths, shots, poses and cameras use others
 
 

@@ -440,7 +440,7 @@ def load_nesf(path: Path) -> NesfWeights:
     tensors, metadata = open_weights(path)
     if metadata.get("field") != MAP_KIND:
         raise WeightsError(
-            f"{path}: weights of kind '{metadata.get('field')}', which label frames (`replay --weights`); to refine "
+            f"{path}: weights of kind '{metadata.get('field')}', which label frames (`map --weights`); to refine "
             f"maps takes weights of kind '{MAP_KIND}'"
         )
     with refusing_damage(path):

@@ -36,7 +36,7 @@ from semantic_mapper.types import Int32, Int64
 FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 3
 CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
-ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper replay`"
+ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper map`"
 
 Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 Corner = tuple[float, float, float]
@@ -124,7 +124,7 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
     if version != FORMAT_VERSION:
         raise MapError(
             f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map again from its "
-            "log with `semantic-mapper replay`, or read it with the version of semantic-mapper that wrote it"
+            "log with `semantic-mapper map`, or read it with the version of semantic-mapper that wrote it"
         )
     try:
         manifest = convert_config(plain, MapManifest, where)

@@ -11,5 +11,5 @@ from tests.contract.runs import replay_room
 
 @pytest.fixture(scope="session")
 def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of ``replay``."""
+    """Results of ``map``."""
     return replay_room(tmp_path_factory.mktemp("contract"))

@@ -122,7 +122,7 @@ def make_files(folder: Path) -> None:
         config = folder / "coarse.toml"
         config.write_text("[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\n")
         out = folder / "coarse"
-        ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
+        ran = api.run_here("map", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
         assert ran.code == 0, ran.stderr
         shutil.copyfile(out / "map.npz", MAP_COARSE)
 

@@ -28,22 +28,22 @@ class Points(NamedTuple):
 
 
 def replay_room(folder: Path, *more: str | Path) -> Path:
-    """``replay`` of the golden log with the golden weights at 5 cm, in this process."""
+    """``map`` of the golden log with the golden weights at 5 cm, in this process."""
     config = folder / "room.toml"
     config.write_text(ROOM_SETTINGS, encoding="utf-8")
     out = folder / "run"
-    ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, *more)
+    ran = api.run_here("map", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, *more)
     assert ran.code == 0, ran.stderr
     return out
 
 
 def replay_kitchen(sequence: Path, folder: Path) -> Path:
-    """``import`` and ``replay`` of a real recording with the weights of the package at 5 cm, in this process."""
+    """``import`` and ``map`` of a real recording with the weights of the package at 5 cm, in this process."""
     log, config = folder / "kitchen.mcap", folder / "room.toml"
     config.write_text(ROOM_SETTINGS, encoding="utf-8")
     ran = api.run_here("import", sequence, log, "--max-frames", str(KITCHEN_FRAMES))
     assert ran.code == 0, ran.stderr
-    ran = api.run_here("replay", log, "--config", config, "--out", folder / "run")
+    ran = api.run_here("map", log, "--config", config, "--out", folder / "run")
     assert ran.code == 0, ran.stderr
     return folder / "run"
 

@@ -173,7 +173,7 @@ def test_corrections_of_then_move_the_map(tmp_path: Path) -> None:
     means = []
     for n, corrections in enumerate((CORRECTIONS, moved)):
         out = tmp_path / str(n)
-        ran = api.run_here("replay", LOG, "--out", out, *settings, "--corrections", corrections)
+        ran = api.run_here("map", LOG, "--out", out, *settings, "--corrections", corrections)
         assert ran.code == 0, ran.stderr
         means.append(VoxelMap.load(out / "map.npz").points().xyz.mean(0))
     np.testing.assert_allclose(means[1] - means[0], (0.5, 0, 0), atol=1e-3)  # five whole voxels

@@ -80,7 +80,7 @@ def test_a_truncated_log_is_replayed_as_far_as_it_goes(tmp_path: Path) -> None:
     log = tmp_path / "cut.mcap"
     log.write_bytes(LOG.read_bytes()[:-CUT_BYTES])
     more = ("--weights", WEIGHTS, "--voxel-size", "0.1")
-    ran = api.run_here("replay", log, "--out", tmp_path / "out", *more, "--json")
+    ran = api.run_here("map", log, "--out", tmp_path / "out", *more, "--json")
     assert ran.code == 0, ran.stderr
     summary = json.loads(ran.stdout)
     assert summary["frames"]["fused"] == FRAMES - 2

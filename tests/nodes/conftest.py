@@ -37,6 +37,6 @@ def config(folder: Path) -> Path:
 def replayed(folder: Path, log: Path, weights: Path, config: Path) -> Path:
     """Results of an in-process replay; its stdout is beside them."""
     out = folder / "replayed"
-    done = run_ok("replay", log, "--out", out, "--weights", weights, "--config", config, "--json")
+    done = run_ok("map", log, "--out", out, "--weights", weights, "--config", config, "--json")
     (out / "stdout.txt").write_text(done.stdout, encoding="utf-8")
     return out

@@ -54,7 +54,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(hostile: Path, config: Path) -> Path:
     out = hostile / "run"
     options = ("--out", out, "--weights", hostile / "tiny.safetensors", "--config", config)
-    assert r"log [/b]\x1b[2J" in plain_text_of("replay", hostile / "log.mcap", *options)
+    assert r"log [/b]\x1b[2J" in plain_text_of("map", hostile / "log.mcap", *options)
     said = plain_text_of("eval", out)
     assert "IoU [/b]" in said and "IoU [bold]x" in said
     return out
@@ -133,7 +133,7 @@ def test_files_and_numbers_that_cannot_be_used_are_refused_by_name(tmp_path: Pat
     for words, said in (
         (("up", folder), f"{folder}: is a folder; launch files"),
         (("info", "/proc/self/mem"), "/proc/self/mem: cannot be read: Input/output error"),
-        (("replay", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
+        (("map", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
         (("import", pipe, tmp_path / "o.mcap"), f"{pipe}: is neither a file nor a folder"),
         (("query", "://", "info"), "://: no endpoint; endpoints read"),
         (("info", big), "value has 5000 digits"),
@@ -157,7 +157,7 @@ def test_no_result_goes_through_a_link(tmp_path: Path, log: Path, weights: Path,
         for link in (name, name + ".part", "part." + name):
             (out / link).symlink_to(target)
     (out / ".writable").symlink_to(tmp_path / "made")
-    run_ok("replay", log, "--out", out, "--weights", weights, "--config", config)
+    run_ok("map", log, "--out", out, "--weights", weights, "--config", config)
     run_ok("eval", out)
     run("compare", replayed, out)
     assert target.read_bytes() == b"precious" and not (tmp_path / "made").exists()
@@ -181,9 +181,9 @@ FORMS = (
         "query {} info --json",
         "fleet table {}",
         "fleet compare {} {}",
-        "fleet run replay {} --out store",
+        "fleet run map {} --out store",
         "fleet merge {} a.npz --out store.npz",
-        "replay {} --out out",
+        "map {} --out out",
         "import {} a.mcap",
         "info {}",
         "view {}",

@@ -14,7 +14,7 @@ from semantic_mapper.replay.run_folder import map_path
     ("file", "says"),
     [
         ("", "give a saved map or a folder"),
-        ("kitchen.mcap", "is a log; `semantic-mapper replay"),
+        ("kitchen.mcap", "is a log; `semantic-mapper map"),
         ("kitchen.npz", "name the map itself, such as"),
         ("run1/map.npz", "name the map itself, such as"),
         ("fleet.json", "a fleet's store: `fleet merge` fuses its maps"),

@@ -167,7 +167,7 @@ def test_pseudo_labels_never_score(new: Path, part_labelled: Path, weights: Path
     said = refused("eval", all_pseudo, *options, "--out", file)
     assert "all of its 6 label images are pseudo labels" in said and "tiny.safetensors has rendered" in said
     for log, scored in ((new, 2), (all_pseudo, 0)):
-        said = run_ok("replay", log, "--out", tmp_path / log.stem, *options).stdout
+        said = run_ok("map", log, "--out", tmp_path / log.stem, *options).stdout
         summary = summary_of(tmp_path / log.stem)
         assert (summary["frames"]["scored"], summary["frames"]["pseudo_labels"]) == (scored, 6 - scored)
         assert (summary["metrics"]["miou"] is None) == (scored == 0)
@@ -224,7 +224,7 @@ def test_computed_depth_has_a_spread_and_never_passes_for_measured(weights: Path
         assert np.array_equal(a.depth_m, b.depth_m) and np.array_equal(a.depth_sigma_m, b.depth_sigma_m)  # type: ignore[arg-type]
     for source, key in (("auto", "computed_fraction"), ("off", "rendered_fraction"), ("sensor", "rendered_fraction")):
         out, options = tmp_path / source, ("--weights", weights, "--config", config, "--depth", source)
-        done = run("replay", deep, "--out", out, *options)
+        done = run("map", deep, "--out", out, *options)
         assert done.returncode == (0 if summary_of(out)["map"]["surface_points"] else 3), done.stderr
         assert summary_of(out)["depth"][key] == 1.0
 

@@ -1,4 +1,4 @@
-"""``compare``: what it prints and its exit codes, on folders that ``replay`` has written."""
+"""``compare``: what it prints and its exit codes, on folders that ``map`` has written."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.nodes.support import refused, run, run_ok
 def test_each_outcome_has_an_exit_code(replayed: Path, log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     copy, fewer = shutil.copytree(replayed, tmp_path / "copy"), tmp_path / "fewer"
     assert json.loads(run_ok("compare", replayed, copy, "--exact", "--json").stdout)["equal"]
-    run_ok("replay", log, "--out", fewer, "--weights", weights, "--config", config, "--max-frames", "5")
+    run_ok("map", log, "--out", fewer, "--weights", weights, "--config", config, "--max-frames", "5")
     done = run("compare", replayed, fewer)
     assert done.returncode == 1 and "different: frames.published, frames.fused" in done.stdout, done.stderr
     loose = (replayed / "map.npz", fewer / "map.npz", "--surface-m", "9", "--labels", "1")

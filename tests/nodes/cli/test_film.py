@@ -52,11 +52,11 @@ def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path)
 def test_what_is_no_film_is_refused_but_not_before_missing_weights_are(tmp_path: Path) -> None:
     film, out = tmp_path / "a.mp4", tmp_path / "out"
     film.write_bytes(b"no film")
-    done = run_process("replay", film, "--out", out)
+    done = run_process("map", film, "--out", out)
     assert done.returncode == 1 and "no film that OpenCV can decode" in done.stderr
     assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1  # FFmpeg's own lines are not shown
     assert not (out / "a.mcap").exists()
-    assert "nope.safetensors" in refused("replay", film, "--out", out, "--weights", tmp_path / "nope.safetensors")
+    assert "nope.safetensors" in refused("map", film, "--out", out, "--weights", tmp_path / "nope.safetensors")
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -65,7 +65,7 @@ def test_without_any_depth_other_weights_map(tmp_path: Path, depth: bool, capfd:
     if not depth:
         shutil.rmtree(folder / "depth")
     (folder / "color" / sorted(file.name for file in (folder / "color").iterdir())[1]).write_bytes(b"damaged")
-    done = run("replay", folder, "--out", tmp_path / "out")
+    done = run("map", folder, "--out", tmp_path / "out")
     said = done.stderr + capfd.readouterr().err
     assert ("rooms-computed-depth.safetensors" in said) != depth and "mapping" in said
     assert "frame left out: frame 1" in done.stdout  # what `import` says is not lost

@@ -100,7 +100,7 @@ def test_a_grid_needs_no_labels_and_claims_none_in_a_replay(log: Path, settings:
     assert "grid: 20 steps" in run_ok("finetune", log, *arguments, "--out", out).stdout
     checkpoint = load_checkpoint(out)
     assert checkpoint.model.kind == "grid" and not checkpoint.train_stamps_ns
-    run_ok("replay", log, "--weights", out, "--out", tmp_path / "replayed")
+    run_ok("map", log, "--weights", out, "--out", tmp_path / "replayed")
     summary = summary_of(tmp_path / "replayed")
     assert summary["frames"]["fused"] == 6
     assert summary["metrics"]["coverage"] == 0.0 and summary["map"]["unknown"] == 1.0  # no class is claimed
@@ -134,7 +134,7 @@ def test_a_field_of_a_scene_labels_its_log_and_maps_it(log: Path, config: Path, 
     run_ok("autolabel", log, "--weights", out, "--overwrite-labels", "--out", tmp_path / "labelled.mcap")
     with open_log(tmp_path / "labelled.mcap") as labelled:
         assert all(f.label is not None and f.label_is_pseudo for f in labelled)
-    done = run_ok("replay", log, "--weights", out, "--config", config, "--out", tmp_path / "replayed")
+    done = run_ok("map", log, "--weights", out, "--config", config, "--out", tmp_path / "replayed")
     assert "known to the weights" in done.stdout
     summary = summary_of(tmp_path / "replayed")
     assert summary["frames"]["excluded_from_scores"] == 2 and summary["frames"]["scored"] == 4  # never on its keyframes

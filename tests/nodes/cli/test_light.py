@@ -48,13 +48,13 @@ LIGHT = (
 ERRORS = (  # of what is heavy where it goes well
     "query map.npz nearest unicorn 0 0 1",
     "export none.npz --out x.ply",
-    "replay none.mcap --out x",
+    "map none.mcap --out x",
     "eval none.mcap",
     "finetune none.mcap --keyframes 3 --seconds 9 --out x.safetensors",
     "autolabel none.mcap --weights rooms --out x.mcap",
     "label none.mcap --suggest 3",
     "merge none.npz map.npz --out x.npz",
-    "fleet run replay none.mcap --out x",
+    "fleet run map none.mcap --out x",
     "refine none.npz --out x.npz",
     "up none.toml",
 )

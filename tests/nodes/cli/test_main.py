@@ -26,7 +26,7 @@ def test_help_lists_all_verbs_and_each_explains_itself_with_an_example() -> None
 @pytest.mark.parametrize(
     "words",
     [
-        "replay room.mcap --out x --voxel-size -1",
+        "map room.mcap --out x --voxel-size -1",
         "import src dst --format film",
         "import src dst --topic image",
         f"finetune {__file__} --keyframes 4 --out w --seconds 0",

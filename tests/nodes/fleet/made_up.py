@@ -31,7 +31,7 @@ def scores_of(seed: int, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
     total = sums.sum(axis=0)
     iou: dict[str, float | None] = {name: float(value) for name, value in zip(NAMES, total[0] / total[2], strict=True)}
     stretches = tuple(tuple(tuple(row) for row in part) for part in sums.tolist())
-    return MethodScores("replay", iou, NAMES, stretches, tuple(range(0, 120, 10)))
+    return MethodScores("map", iou, NAMES, stretches, tuple(range(0, 120, 10)))
 
 
 def made_up(log: int, *, loss: float = 0.0, noise: float = 0.0, noise_seed: int = 0, **changes: Any) -> TaskResult:
@@ -39,7 +39,7 @@ def made_up(log: int, *, loss: float = 0.0, noise: float = 0.0, noise_seed: int 
     scores = scores_of(log, loss, noise, noise_seed)
     miou = float(miou_of_sums(np.array(scores.stretches, np.float64).sum(axis=0, keepdims=True))[0])
     values: dict[str, Any] = {
-        "operation": "replay",
+        "operation": "map",
         "log": f"/logs/{log:04d}.mcap",
         "log_digest": hashlib.sha256(f"log {log}".encode()).hexdigest(),
         "tags": {"robot": f"r{log % 3}"},

@@ -92,10 +92,10 @@ def test_a_class_a_method_and_the_latest_result_can_decide(compared: Any) -> Non
     found = compared(logs(6), logs(6, loss=0.1), metric="iou:lamp")
     assert found.reasons and found.logs[0].estimate is not None
     named = [
-        [with_findings(r, metrics={"miou replay": r.findings.metrics["miou"]}) for r in results]
+        [with_findings(r, metrics={"miou map": r.findings.metrics["miou"]}) for r in results]
         for results in (logs(6), logs(6, loss=0.1))
     ]
-    assert compared(*named, metric="miou replay").count("worse") == 6
+    assert compared(*named, metric="miou map").count("worse") == 6
     later = made_up(0, loss=0.3, version="0.2.0", finished_ns=FINISHED_NS + 10**15)
     found = compared(logs(3), [*logs(3), later])
     assert found.count("worse") == 1 and found.logs[0].log == later.log
@@ -104,9 +104,9 @@ def test_a_class_a_method_and_the_latest_result_can_decide(compared: Any) -> Non
 def test_what_cannot_be_compared_says_what_there_is(compared: Any) -> None:
     both = [made_up(1), made_up(1, operation="eval")]
     for pair, options, said in (
-        ((both, both), {}, r"\(--operation\): eval, replay"),
-        ((both, both), {"operation": "finetune"}, r"\(--operation\): eval, replay"),
-        (([made_up(1)], [made_up(2)]), {}, "no log has results of `replay` in both"),
+        ((both, both), {}, r"\(--operation\): eval, map"),
+        ((both, both), {"operation": "finetune"}, r"\(--operation\): eval, map"),
+        (([made_up(1)], [made_up(2)]), {}, "no log has results of `map` in both"),
         ((both, both), {"operation": "eval", "metric": "moiu"}, "'moiu'; did you mean `miou`"),
     ):
         with pytest.raises(ConfigError, match=said):

@@ -38,7 +38,7 @@ def done(task: Task, log: Path) -> TaskResult:
 def test_a_replay_of_the_fleet_is_that_of_the_verb(
     tmp_path: Path, log: Path, weights: Path, config: Path, replayed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task = task_of("replay", tmp_path / "store", weights, config)
+    task = task_of("map", tmp_path / "store", weights, config)
     found = done(task, log)
     assert set(found.files) >= {"map.npz", "summary.json", "report.html", "overview.png"}
     assert found.files["map.npz"] == run.file_digest(replayed / "map.npz")
@@ -57,12 +57,12 @@ def test_a_replay_of_the_fleet_is_that_of_the_verb(
 
 
 def test_other_settings_weights_content_or_code_are_another_result(tmp_path: Path, weights: Path) -> None:
-    task = task_of("replay", tmp_path, weights)
+    task = task_of("map", tmp_path, weights)
     others = [replace(task, weights_data=b"other"), replace(task, code="other"), replace(task, operation="eval")]
-    others.append(task_of("replay", tmp_path, weights, None, "max_frames=2"))
+    others.append(task_of("map", tmp_path, weights, None, "max_frames=2"))
     keys = {task.key("digest"), task.key("other"), *(other.key("digest") for other in others)}
     assert len(keys) == 6
-    assert task_of("replay", tmp_path, weights, None, "max_frames=0").key("digest") in keys
+    assert task_of("map", tmp_path, weights, None, "max_frames=0").key("digest") in keys
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_refine_takes_maps(tmp_path: Path, replayed: Path) -> None:
 
 
 def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Path) -> None:
-    task = task_of("replay", tmp_path / "store", weights)
+    task = task_of("map", tmp_path / "store", weights)
     for changes, url, error, why in (
         ({"code": "other"}, log, FleetError, "install the same everywhere"),
         ({}, tmp_path / "none.mcap", LogError, "no such log"),
@@ -104,10 +104,10 @@ def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Pa
 
 def test_no_store_is_made_for_what_cannot_be_run(tmp_path: Path) -> None:
     for operation, weights, sets, why in (
-        ("replay", None, "max_frame=3", "did you mean `max_frames`"),
+        ("map", None, "max_frame=3", "did you mean `max_frames`"),
         ("finetune", None, "second=3", "did you mean `seconds`"),
-        ("replay", None, "voxel_map.voxel_size=3", "voxel_size_m"),
-        ("replay", "none.safetensors", "max_frames=3", r"none\.safetensors: is missing"),
+        ("map", None, "voxel_map.voxel_size=3", "voxel_size_m"),
+        ("map", "none.safetensors", "max_frames=3", r"none\.safetensors: is missing"),
     ):
         with pytest.raises((ConfigError, StoreError), match=why):
             run.make_task(operation, str(tmp_path / "store"), weights, [sets])
@@ -125,7 +125,7 @@ def _cluster() -> Iterator[None]:
 
 def run_logs(folder: Path, *logs: str, **options: Any) -> RunReport:
     (folder / "traces").mkdir(exist_ok=True)
-    task = Task("replay", Store(str(folder / "store"), create=True).url, {}, {}, "", b"", "")
+    task = Task("map", Store(str(folder / "store"), create=True).url, {}, {}, "", b"", "")
     inputs = [LogInput(log, {"traces": str(folder / "traces")}) for log in logs]
     return run_fleet(task, inputs, memory_gb=0.001, function=do_as_named, **options)
 
@@ -161,7 +161,7 @@ def test_a_stop_ends_tasks_at_once_and_the_same_command_tries_failed_logs_again(
 @pytest.mark.slow
 @pytest.mark.usefixtures("_cluster")
 def test_what_no_node_has_is_refused_at_once(tmp_path: Path) -> None:
-    task = Task("replay", Store(str(tmp_path), create=True).url, {}, {}, "", b"", "")
+    task = Task("map", Store(str(tmp_path), create=True).url, {}, {}, "", b"", "")
     for needs, what in (({"cpus": 64}, "64 CPUs"), ({"gpus": 1}, "1 GPUs"), ({"memory_gb": 1e6}, "1e.06 GB")):
         with pytest.raises(FleetError, match=what):
             run_fleet(task, [LogInput("a")], function=do_as_named, **needs)

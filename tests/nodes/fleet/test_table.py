@@ -24,7 +24,7 @@ def test_a_log_is_a_row_with_its_metrics_costs_and_tags(tmp_path: Path) -> None:
     assert (row["tag_robot"], row["tag_what_for"]) == ("r1", None) and row["finished"].startswith("2026-09-")
     assert json.loads(row["settings"]) == {"render": {"scale": 0.25}}
     assert [r[0] for r in tables.query("SELECT name FROM classes JOIN logs USING (key) LIMIT 4").values] == list(NAMES)
-    assert tables.query("FROM failures").values[0][:2] == ("replay", result.log)
+    assert tables.query("FROM failures").values[0][:2] == ("map", result.log)
     assert tables.query("SELECT kind, text FROM events").values == [("refused", "frame 7: pose jumps")] * 2
     assert tables.columns()["logs"][:3] == ("key", "operation", "log")
     found = tables.query("log, round(miou, 1) AS miou")  # columns alone are those of logs

@@ -50,7 +50,7 @@ def test_a_killed_mapper_leaves_the_map_of_a_frame(weights: Path, tmp_path: Path
     assert first < saved.frames < 400 and saved.block_count > 2 * CHUNK_BLOCKS
     assert not (out / "summary.json").exists(), "nothing says that the results are whole"
     options = ("--weights", weights, "--config", config, "--max-frames", str(saved.frames))
-    run_ok("replay", log, "--out", again, *options)
+    run_ok("map", log, "--out", again, *options)
     assert same(saved.block_state(), VoxelMap.load(again / "map.npz").block_state())
 
 

@@ -147,7 +147,7 @@ def test_two_scenes_are_refused_with_their_times(tmp_path: Path, walked: Walked)
 @pytest.mark.slow
 def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked: Walked) -> None:
     out = tmp_path / "out"
-    done = run("replay", walked[0], "--out", out, "--voxel-size", "0.05")
+    done = run("map", walked[0], "--out", out, "--voxel-size", "0.05")
     assert done.returncode == 0, done.stderr
     assert str(out / "report.html") in done.stdout
     summary = json.loads((out / "summary.json").read_text())

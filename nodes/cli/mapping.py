@@ -1,4 +1,4 @@
-"""The verbs ``replay`` and ``demo``: a recording becomes a map, in this process."""
+"""The verbs ``map`` and ``demo``: a recording becomes a map, in this process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FilmSourceOptions(SourceOptions, frozen=True):
 
 
 @verb
-def replay(
+def map_(
     output: JsonOutput,
     # Recorded log (.mcap), its parts, or a folder with them; or a film, pictures or recording that `import` takes
     source: list[Path],
@@ -59,9 +59,9 @@ def replay(
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
     Where poses and depth contradict each other, the map is written and the exit code is 3.
 
-    Example: semantic-mapper replay path/to/redkitchen --open
-    Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
-    Example: semantic-mapper replay film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
+    Example: semantic-mapper map path/to/redkitchen --open
+    Example: semantic-mapper map kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
+    Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     must_be_there(*source)
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
@@ -81,11 +81,11 @@ def replay(
     elif options.given:
         raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
     with StopRequest() as stop:
-        with frame_progress("replay", None, stop=stop) as bar:
+        with frame_progress("map", None, stop=stop) as bar:
             summary, _ = replay_log(
                 source, out, weights, config, max_frames, rerun=rerun, corrections=corrections, monitor=bar
             )
-        show_replay(output, summary, out)
+        show_result(output, summary, out)
         output.json(summary)
         if open_:
             webbrowser.open((out / "report.html").resolve().as_uri())
@@ -117,14 +117,14 @@ def demo(
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:
             summary, _ = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar)
-        show_replay(output, summary, out)
+        show_result(output, summary, out)
         output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"
         stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
         return stop.exit_code
 
 
-def show_replay(output: Output, summary: Mapping[str, Any], out: Path) -> None:
+def show_result(output: Output, summary: Mapping[str, Any], out: Path) -> None:
     """What became of one replay, notes and files, for people."""
     for part in (*headlines(summary), *notes(summary), *result_lines(out)):
         output.print(part)

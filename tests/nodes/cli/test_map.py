@@ -1,4 +1,4 @@
-"""``replay`` and ``demo``: what they write and say, and what they do about bad input and folders that others use."""
+"""``map`` and ``demo``: what they write and say, and what they do about bad input and folders that others use."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_missing_weights_unknown_settings_and_bad_corrections_are_named(log: Pat
         ("--config", wrong, "did you mean `voxel_size_m`?"),
         ("--corrections", corrections, "corrections.txt: holds no pose"),
     ):
-        assert said in refused("replay", log, "--out", tmp_path / "out", option, file)
+        assert said in refused("map", log, "--out", tmp_path / "out", option, file)
 
 
 def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
@@ -60,7 +60,7 @@ def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path,
     content = bytearray(log.read_bytes())
     content[len(content) * 11 // 12] ^= 0xFF  # in the last frame
     log.write_bytes(content)
-    done = run_ok("replay", log, "--out", tmp_path / "out", "--weights", weights, "--config", config, "--json")
+    done = run_ok("map", log, "--out", tmp_path / "out", "--weights", weights, "--config", config, "--json")
     summary = json.loads(done.stdout)
     assert (summary["frames"]["published"], summary["frames"]["fused"]) == (6, 4)
     reasons = [r["reason"] for r in summary["refusals"]]
@@ -74,7 +74,7 @@ def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path,
 @pytest.mark.slow
 def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights: Path, config: Path) -> None:
     log, out = write_log(tmp_path / "long.mcap", repeated_frames(400)), tmp_path / "out"
-    with Running("replay", log, "--out", out, "--weights", weights, "--config", config) as running:
+    with Running("map", log, "--out", out, "--weights", weights, "--config", config) as running:
         running.wait_for_line(r"\bmapping\b")
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 130, running.text
@@ -86,7 +86,7 @@ def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights:
 def test_frames_that_weights_were_finetuned_on_are_never_scored(log: Path, config: Path, tmp_path: Path) -> None:
     tuned = write_weights(tmp_path / "tuned.safetensors", [f.stamp_ns for f in tiny_frames(6)[:2]])
     options = ("--weights", tuned, "--config", config, "--max-frames", "3")
-    done = run_ok("replay", log, "--out", tmp_path / "out", *options)
+    done = run_ok("map", log, "--out", tmp_path / "out", *options)
     frames = summary_of(tmp_path / "out")["frames"]
     assert (frames["fused"], frames["scored"], frames["excluded_from_scores"]) == (3, 1, 2)
     assert "2 frames left out of the scores" in done.stdout
@@ -95,7 +95,7 @@ def test_frames_that_weights_were_finetuned_on_are_never_scored(log: Path, confi
 def test_corrections_move_the_map_at_the_end(log: Path, weights: Path, tmp_path: Path) -> None:
     file, out = tmp_path / "corrected.txt", tmp_path / "out"
     file.write_text("".join(f"{f.stamp_ns / 1e9:.9f} 1 2 3 0 0 0 1\n" for f in tiny_frames()[:2]))
-    run_ok("replay", log, "--out", out, "--weights", weights, "--corrections", file)
+    run_ok("map", log, "--out", out, "--weights", weights, "--corrections", file)
     assert summary_of(out)["map"]["corrected_poses"] == 2
 
 
@@ -106,7 +106,7 @@ def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path
     T_camera_body = np.linalg.inv(T_body_camera)
     frames = [replace(f, T_world_camera=f.T_world_camera @ T_camera_body) for f in tiny_frames(30, seed=13)]
     write_log(tmp_path / "log.mcap", frames)
-    command = ("replay", tmp_path / "log.mcap", "--out", tmp_path / "run", "--quality", "fast")
+    command = ("map", tmp_path / "log.mcap", "--out", tmp_path / "run", "--quality", "fast")
     assert run(*command).returncode == 3
     run_ok(*command, "--accept-contradictions")
     assert "x forward" in summary_of(tmp_path / "run")["pose_check"]["warning"]
@@ -126,7 +126,7 @@ def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
 def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with hold_folder(out):
-        for words in (("up", REPLAY_LAUNCH, "--set", f"camera.log={log}"), ("replay", log)):
+        for words in (("up", REPLAY_LAUNCH, "--set", f"camera.log={log}"), ("map", log)):
             assert "another run writes its results there" in refused(*words, "--out", out)
         with hold_folder(tmp_path / "other"):
             pass
@@ -137,7 +137,7 @@ def test_a_refused_run_leaves_no_folder_and_a_stopped_one_what_it_has_written(tm
     (tmp_path / "bad.mcap").write_bytes(b"no log")
     (tmp_path / "pictures").mkdir()
     for name in ("bad.mcap", "pictures"):
-        assert name in refused("replay", tmp_path / name, "--out", tmp_path / "runs" / "out")
+        assert name in refused("map", tmp_path / name, "--out", tmp_path / "runs" / "out")
         assert not (tmp_path / "runs").exists()
     with pytest.raises(FileExistsError), hold_folder(tmp_path / "out"):  # noqa: PT012
         (tmp_path / "out" / "map.npz").touch()
