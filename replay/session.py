@@ -28,7 +28,7 @@ from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
     from semantic_mapper.mapping.pipeline import MappingPipeline
-    from semantic_mapper.replay.exporters.rerun_log import RerunLog
+    from semantic_mapper.replay.rerun_log import RerunLog
 
 _log = get_logger(__name__)
 
@@ -295,6 +295,6 @@ def open_recording(path: Path | None, pipeline: MappingPipeline) -> RerunLog | N
     if path is None:
         return None
     # It loads for over a second, and few sessions need it.
-    from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
+    from semantic_mapper.replay.rerun_log import RerunLog, recording_file
 
     return RerunLog(recording_file(path), pipeline.label_set, pipeline.voxel_map.config.voxel_size_m)

@@ -31,7 +31,7 @@ VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
     ("code", "expected"),
     [
         ("import semantic_mapper.replay.exporters.map_files, semantic_mapper.nodes.cli.main; print('fine')", "fine"),
-        (TRY.format("import semantic_mapper.replay.exporters.rerun_log"), "pip install 'semantic-mapper[viewer]'"),
+        (TRY.format("import semantic_mapper.replay.rerun_log"), "pip install 'semantic-mapper[viewer]'"),
         (
             TRY.format(f"{FILM}; f(Path('a.mp4'), Path('a.mcap'), FilmOptions(), print)"),
             "pip install 'semantic-mapper[sfm]'",

@@ -103,7 +103,7 @@ class _Page(WebViewer):
 
     def begin(self) -> RecordingStream:
         """What writes on it."""
-        from semantic_mapper.replay.exporters.rerun_log import recording_server
+        from semantic_mapper.replay.rerun_log import recording_server
 
         self._output.address("watch at", self.page_url)
         stream = recording_server(self.data_url)

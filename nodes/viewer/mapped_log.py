@@ -10,9 +10,9 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.viewer.sources import Begin, MapShow
 from semantic_mapper.queries.snapshot import MapMirror
-from semantic_mapper.replay.exporters.rerun_log import RerunLog
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.rerun_log import RerunLog
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
 

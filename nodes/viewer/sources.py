@@ -20,7 +20,8 @@ from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
-from semantic_mapper.replay.exporters.rerun_log import RerunLog, rr
+from semantic_mapper.replay.rerun_layout import rr
+from semantic_mapper.replay.rerun_log import RerunLog
 from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import NewestSubscriber

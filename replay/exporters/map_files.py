@@ -151,7 +151,7 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
         write_npz(path, points, labels, scale_known=voxel_map.scale_known)
     else:
         with atomic_path(path, raises=MapError) as part:
-            from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
+            from semantic_mapper.replay.rerun_log import RerunLog, recording_file
 
             log = RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m)
             log.note_scale(voxel_map.scale_known)

@@ -104,7 +104,7 @@ def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
     if name == "foxglove":
         return FoxgloveExporter(place, info)
     if name == "rrd":
-        from semantic_mapper.replay.exporters.rerun_log import RerunExporter
+        from semantic_mapper.replay.exporters.rerun import RerunExporter
 
         return RerunExporter(place, info)
     if name == "trajectory":

@@ -29,8 +29,8 @@ from semantic_mapper.nodes.viewer.mapped_log import show_log
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.snapshot import BlockAges, MapMirror
-from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.replay.job_monitor import JobMonitor
+from semantic_mapper.replay.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream

@@ -16,7 +16,8 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up, read_costs
-from semantic_mapper.replay.exporters.rerun_log import COMPUTED_COLOR, MEASURED_COLOR, RerunLog, recording_file
+from semantic_mapper.replay.rerun_layout import COMPUTED_COLOR, MEASURED_COLOR
+from semantic_mapper.replay.rerun_log import RerunLog, recording_file
 from tests.mapping.rendered_views import frame, plane_depth, small_map, sure
 from tests.mapping.test_formats import read_glb
 from tests.queries.test_measured import part_measured

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.replay.exporters.base import MAX_PATH, CameraPath
-from semantic_mapper.replay.exporters.rerun_log import eye_on, moving_points
+from semantic_mapper.replay.rerun_layout import eye_on
+from semantic_mapper.replay.rerun_log import moving_points
 from semantic_mapper.types import CameraIntrinsics, MapUpdate
 
 SIZE = np.array((5.0, 4.0, 2.6))

@@ -1,7 +1,7 @@
 """What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in five colourings, stage times.
 
-The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike. The SDK is an extra:
-import it from here. Raises DependencyError: on import, where the extra is not installed.
+The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike; ``rerun_layout`` says
+how. Raises DependencyError: on import, where the extra is not installed.
 """
 
 from __future__ import annotations
@@ -9,45 +9,36 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from semantic_mapper.errors import DependencyError, LogError
-from semantic_mapper.evaluation.upright import camera_up, ceiling_height, upright_rotation
+from semantic_mapper.errors import LogError
+from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import scale_intrinsics
-from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
-from semantic_mapper.plots import (
-    DIM_TEXT,
-    UNKNOWN,
-    class_rows,
-    new_figure,
-    place,
-    put_legend,
-    put_picture,
-    put_text,
-    rendered,
-)
+from semantic_mapper.plots import UNKNOWN
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
-from semantic_mapper.replay.exporters.base import CameraPath, ExportFrame
-from semantic_mapper.replay.overview import open_side
-from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame, UInt8
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-try:
-    import rerun as rr
-    import rerun.blueprint as rrb
-except ModuleNotFoundError as error:
-    raise DependencyError(
-        "the viewer and Rerun files need the package rerun-sdk: pip install 'semantic-mapper[viewer]'"
-    ) from error
+from semantic_mapper.replay.exporters.base import CameraPath
+from semantic_mapper.replay.rerun_layout import (
+    AGE_SCALE,
+    AGED_S,
+    COMPUTED_COLOR,
+    CONFIDENCE_SCALE,
+    MEASURED_COLOR,
+    Eye,
+    camera_path,
+    draw_map_legend,
+    eye_on,
+    layout,
+    rr,
+    scale_colors,
+)
+from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame
 
 APPLICATION = "semantic_mapper"
 IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log stays small
@@ -58,13 +49,6 @@ FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
 GONE_COLOR = (150, 150, 150)
-MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
-AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
-CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
-LEGEND_WIDTH = 260
-ELEVATION = np.deg2rad(50)  # from which one looks into the map
-DISTANCE = 0.8  # of the eye, times the map's diagonal
-_MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
 def recording_file(path: Path) -> rr.RecordingStream:
@@ -277,149 +261,3 @@ def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:
 def _as_logged(k: CameraIntrinsics) -> CameraIntrinsics:
     width = min(k.width, IMAGE_WIDTH)
     return scale_intrinsics(k, width, round(k.height * width / k.width))
-
-
-class RerunExporter:
-    """Writes one file, with the writer that draws sessions."""
-
-    def __init__(self, path: Path, info: StreamInfo) -> None:
-        self.notices: list[str] = []
-        self._label_set = info.label_set or make_label_set("none", ["no class"])
-        self._noted: set[str] = set()
-        self._log = RerunLog(recording_file(path), self._label_set)
-        self._log.note_scale(info.scale_known)
-
-    def add(self, item: ExportFrame) -> None:
-        """Draw one frame: what the log itself says of it, where a session has what was rendered."""
-        frame = item.frame
-        if frame.label_is_pseudo:
-            self._note("labels", "pseudo labels, which weights have rendered: no truth")
-        if frame.depth_sigma_m is not None:
-            self._note("depth", "computed, not a sensor's")
-        size = (frame.intrinsics.height, frame.intrinsics.width)
-        update = MapUpdate(
-            stamp_ns=frame.stamp_ns,
-            seq=frame.seq,
-            camera_id=frame.camera_id,
-            fused=False,
-            is_keyframe=False,
-            source_seqs=(),
-            label=np.full(size, self._label_set.ignore_id, np.uint8) if frame.label is None else frame.label,
-            confidence=np.zeros(size, np.float32),
-            depth_m=np.zeros(size, np.float32) if frame.depth_m is None else frame.depth_m,
-            blocks=0,
-            blocks_touched=0,
-            stage_ms={},
-        )
-        self._log.log_step(frame, update)
-
-    def _note(self, name: str, text: str) -> None:
-        if name not in self._noted:
-            self._noted.add(name)
-            self._log.note(name, f"{text}, at least of some frames")
-            self.notices.append(f"{name}: {text}, at least of some frames; the entity `{name}` says so")
-
-    def finish(self) -> None:
-        """Draw the way of each camera, and close the file."""
-        nothing = np.zeros((0, 3), np.float32)
-        self._log.finish(MapPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.uint8), np.zeros(0, np.float32)))
-
-
-class Eye(NamedTuple):
-    """From where the map is looked at first: position, target and up (3,), world metres."""
-
-    position: Float64
-    target: Float64
-    up: Float64
-
-
-def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
-    """An eye on a map, points (N, 3), N > 0, from its most open side: from above, or, of a room with a ceiling, from
-    inside, out of a corner. ``up`` (3,) is a first guess of which way is up; None = unknown."""
-    R_upright_world = upright_rotation(xyz, up)
-    upright = xyz.astype(np.float64) @ R_upright_world.T
-    low, high = np.percentile(upright, (1, 99), axis=0)
-    target, size = (low + high) / 2, np.maximum(high - low, 0.3)
-    azimuth = open_side(upright)
-    towards = np.array((np.cos(azimuth), np.sin(azimuth)))
-    if ceiling_height(upright) is None:
-        direction = np.append(towards * np.cos(ELEVATION), np.sin(ELEVATION))
-        position = target + DISTANCE * float(np.linalg.norm(size)) * direction
-    else:
-        corner = towards / np.abs(towards / size[:2]).max()  # half of the way there is the side of the bounds
-        position = np.append(target[:2] + 0.4 * corner, low[2] + 0.8 * size[2])
-        target = np.append(target[:2] - 0.15 * corner, low[2] + 0.2 * size[2])
-    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2])
-
-
-def scale_colors(level: Float32, scale: int) -> UInt8:
-    """Colours (N, 3) of a colour map of OpenCV for levels (N,) in 0..1."""
-    steps = np.clip(level * 255 + 0.5, 0, 255).astype(np.uint8)
-    table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], scale), np.uint8)
-    return table[:, 0, ::-1][steps]
-
-
-@rendered
-def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool, computed: float = 0.0) -> Figure:
-    """Picture of the classes of a map's points (N,), of the scales of confidence and (``aged``) age, and of what was
-    measured, where a fraction ``computed`` was not."""
-    rows = class_rows(labels, label_set)
-    if computed:
-        rows += [("measured", MEASURED_COLOR, 1 - computed), ("computed", COMPUTED_COLOR, computed)]
-    scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
-    scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
-    width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
-    top = _MARGIN + _CAPTION
-    figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + len(scales) * (_CAPTION + _BAR + _MARGIN))
-    put_text(place(figure, (_MARGIN, _MARGIN, width, _CAPTION)), (0, 8), "class, fraction of the map", color=DIM_TEXT)
-    put_legend(figure, (_MARGIN, top, width, height), rows)
-    y = top + height + _MARGIN + _CAPTION
-    for caption, scale in scales:
-        bar = scale_colors(np.linspace(0, 1, width, dtype=np.float32), scale)
-        put_picture(figure, (_MARGIN, y, width, _BAR), bar[None], caption)
-        y += _CAPTION + _BAR + _MARGIN
-    return figure
-
-
-def camera_path(camera: str) -> str:
-    """Entity of a camera; its image plane is below it."""
-    return rr.new_entity_path(["world", "cameras", camera])
-
-
-def layout(cameras: Sequence[str], colourings: Sequence[str], eye: Eye | None) -> rrb.Blueprint:
-    """The map in one tab a colouring, the legend next to it, the images of each camera, and the times of all stages.
-
-    Without ``cameras`` it is a map alone; without an ``eye``, from where to look at it first, there is no map yet.
-    """
-    seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb", "moving")]
-    seen = [line.rstrip("/") for line in seen] + ["+ /world/path/**"]
-    eyes = eye and rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
-    maps = [
-        rrb.Spatial3DView(
-            origin="/world",
-            contents=[*seen, f"+ /world/map/{name}", *(["+ /world/graph/**"] if name == "class" else [])],
-            name=f"map: {name}",
-            eye_controls=eyes,
-            line_grid=False,
-        )
-        for name in colourings
-    ]
-    space = rrb.Tabs(*maps, active_tab=0, name="map")
-    legend = rrb.Spatial2DView(origin="/legend", name="legend")
-    above = rrb.Horizontal(space, legend, column_shares=[4, 1]) if eye is not None else space
-    panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
-    if not cameras:
-        return rrb.Blueprint(above, rrb.TimePanel(state="hidden"), *panels)
-    kinds = ("rgb", "semantics", "depth")
-    rows = [
-        [rrb.Spatial2DView(origin=f"{camera_path(c)}/image", contents=f"$origin/{k}", name=f"{c}: {k}") for k in kinds]
-        for c in cameras
-    ]
-    images = rrb.Horizontal(*rows[0]) if len(rows) == 1 else rrb.Tabs(*(rrb.Horizontal(*row) for row in rows))
-    times = rrb.TimeSeriesView(origin="/stage_ms", name="stage times, ms")
-    below = rrb.Horizontal(images, times, column_shares=[3, 2])
-    return rrb.Blueprint(
-        rrb.Vertical(above, below, row_shares=[2, 1]),
-        rrb.TimePanel(state="collapsed", timeline="capture", play_state="following"),
-        *panels,
-    )

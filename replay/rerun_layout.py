@@ -1,0 +1,147 @@
+"""The page that Rerun shows: its layout, from where the map is looked at first, colour scales and legend.
+
+The SDK is an extra: import it from here. Raises DependencyError: on import, where it is not installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+
+from semantic_mapper.errors import DependencyError
+from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.plots import (
+    DIM_TEXT,
+    class_rows,
+    new_figure,
+    place,
+    put_legend,
+    put_picture,
+    put_text,
+    rendered,
+)
+from semantic_mapper.replay.overview import open_side
+from semantic_mapper.types import Float32, Float64, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+try:
+    import rerun as rr
+    import rerun.blueprint as rrb
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        "the viewer and Rerun files need the package rerun-sdk: pip install 'semantic-mapper[viewer]'"
+    ) from error
+
+MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
+AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
+CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
+LEGEND_WIDTH = 260
+ELEVATION = np.deg2rad(50)  # from which one looks into the map
+DISTANCE = 0.8  # of the eye, times the map's diagonal
+_MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
+
+
+class Eye(NamedTuple):
+    """From where the map is looked at first: position, target and up (3,), world metres."""
+
+    position: Float64
+    target: Float64
+    up: Float64
+
+
+def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
+    """An eye on a map, points (N, 3), N > 0, from its most open side: from above, or, of a room with a ceiling, from
+    inside, out of a corner. ``up`` (3,) is a first guess of which way is up; None = unknown."""
+    R_upright_world = upright_rotation(xyz, up)
+    upright = xyz.astype(np.float64) @ R_upright_world.T
+    low, high = np.percentile(upright, (1, 99), axis=0)
+    target, size = (low + high) / 2, np.maximum(high - low, 0.3)
+    azimuth = open_side(upright)
+    towards = np.array((np.cos(azimuth), np.sin(azimuth)))
+    if ceiling_height(upright) is None:
+        direction = np.append(towards * np.cos(ELEVATION), np.sin(ELEVATION))
+        position = target + DISTANCE * float(np.linalg.norm(size)) * direction
+    else:
+        corner = towards / np.abs(towards / size[:2]).max()  # half of the way there is the side of the bounds
+        position = np.append(target[:2] + 0.4 * corner, low[2] + 0.8 * size[2])
+        target = np.append(target[:2] - 0.15 * corner, low[2] + 0.2 * size[2])
+    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2])
+
+
+def scale_colors(level: Float32, scale: int) -> UInt8:
+    """Colours (N, 3) of a colour map of OpenCV for levels (N,) in 0..1."""
+    steps = np.clip(level * 255 + 0.5, 0, 255).astype(np.uint8)
+    table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], scale), np.uint8)
+    return table[:, 0, ::-1][steps]
+
+
+@rendered
+def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool, computed: float = 0.0) -> Figure:
+    """Picture of the classes of a map's points (N,), of the scales of confidence and (``aged``) age, and of what was
+    measured, where a fraction ``computed`` was not."""
+    rows = class_rows(labels, label_set)
+    if computed:
+        rows += [("measured", MEASURED_COLOR, 1 - computed), ("computed", COMPUTED_COLOR, computed)]
+    scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
+    scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
+    width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
+    top = _MARGIN + _CAPTION
+    figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + len(scales) * (_CAPTION + _BAR + _MARGIN))
+    put_text(place(figure, (_MARGIN, _MARGIN, width, _CAPTION)), (0, 8), "class, fraction of the map", color=DIM_TEXT)
+    put_legend(figure, (_MARGIN, top, width, height), rows)
+    y = top + height + _MARGIN + _CAPTION
+    for caption, scale in scales:
+        bar = scale_colors(np.linspace(0, 1, width, dtype=np.float32), scale)
+        put_picture(figure, (_MARGIN, y, width, _BAR), bar[None], caption)
+        y += _CAPTION + _BAR + _MARGIN
+    return figure
+
+
+def camera_path(camera: str) -> str:
+    """Entity of a camera; its image plane is below it."""
+    return rr.new_entity_path(["world", "cameras", camera])
+
+
+def layout(cameras: Sequence[str], colourings: Sequence[str], eye: Eye | None) -> rrb.Blueprint:
+    """The map in one tab a colouring, the legend next to it, the images of each camera, and the times of all stages.
+
+    Without ``cameras`` it is a map alone; without an ``eye``, from where to look at it first, there is no map yet.
+    """
+    seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb", "moving")]
+    seen = [line.rstrip("/") for line in seen] + ["+ /world/path/**"]
+    eyes = eye and rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
+    maps = [
+        rrb.Spatial3DView(
+            origin="/world",
+            contents=[*seen, f"+ /world/map/{name}", *(["+ /world/graph/**"] if name == "class" else [])],
+            name=f"map: {name}",
+            eye_controls=eyes,
+            line_grid=False,
+        )
+        for name in colourings
+    ]
+    space = rrb.Tabs(*maps, active_tab=0, name="map")
+    legend = rrb.Spatial2DView(origin="/legend", name="legend")
+    above = rrb.Horizontal(space, legend, column_shares=[4, 1]) if eye is not None else space
+    panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    if not cameras:
+        return rrb.Blueprint(above, rrb.TimePanel(state="hidden"), *panels)
+    kinds = ("rgb", "semantics", "depth")
+    rows = [
+        [rrb.Spatial2DView(origin=f"{camera_path(c)}/image", contents=f"$origin/{k}", name=f"{c}: {k}") for k in kinds]
+        for c in cameras
+    ]
+    images = rrb.Horizontal(*rows[0]) if len(rows) == 1 else rrb.Tabs(*(rrb.Horizontal(*row) for row in rows))
+    times = rrb.TimeSeriesView(origin="/stage_ms", name="stage times, ms")
+    below = rrb.Horizontal(images, times, column_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Vertical(above, below, row_shares=[2, 1]),
+        rrb.TimePanel(state="collapsed", timeline="capture", play_state="following"),
+        *panels,
+    )
