@@ -73,6 +73,7 @@ class CameraOptions(Config, frozen=True):
     mode: Literal["lockstep", "realtime", "fast"] = "lockstep"  # wait for the mapper; keep the recording's time; hurry
     mapper: str = "mapper"  # lockstep: the node whose answers are waited for
     rate: Annotated[float, msgspec.Meta(ge=0.001, le=1000)] = 1.0  # realtime: 2 = twice as fast as recorded
+    loop: bool = False  # play the log again and again: stamps and numbers go on, labels come the first time only
     max_frames: Count = 0  # 0 = all
     # How long a mapper that is waited for (lockstep, fast, a video) may take for one frame; the first one compiles.
     ack_timeout_s: Positive = 300.0

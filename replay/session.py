@@ -126,7 +126,7 @@ class MapSession:
         self.left_out = 0  # by the import that has made the log
         self.without_depth = 0  # their geometry was rendered, not measured
         self.outside = 0  # that weights of one scene know less than half of
-        self._known: list[float] = []  # of each frame, the fraction that they know
+        self._known, self._mapped = 0.0, 0  # fractions of frames that they know, in sum; frames
         self.computed_depth = 0  # their geometry was computed from the pictures
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
@@ -200,7 +200,7 @@ class MapSession:
             self.too_little_motion += not frame.depth_m.any()
         # How much weights of one scene know of it: weights of another scene cannot be recognised otherwise.
         known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
-        self._known.append(known)
+        self._known, self._mapped = self._known + known, self._mapped + 1
         self.outside += known < MOSTLY
         frame = self.pipeline.corrector.place(frame)  # where the map has it
         scored = self._score(frame, update)
@@ -255,9 +255,9 @@ class MapSession:
     def more_summary(self) -> dict[str, Any]:
         """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
         sessions, found = self.odometry_sessions, dict[str, Any]()
-        model, mapped = self.mapper.checkpoint.model, len(self._known)
+        model, mapped = self.mapper.checkpoint.model, self._mapped
         if model.holds_scene and model.knows_classes and mapped:
-            found["scene"] = {"known": round(sum(self._known) / mapped, 4), "frames_outside": self.outside}
+            found["scene"] = {"known": round(self._known / mapped, 4), "frames_outside": self.outside}
             if self.outside > MOSTLY * mapped:
                 reason = "the weights know less than half of these frames: made for another scene or world frame"
                 _log.warning("scene_unknown", frames=self.outside, of=mapped, reason=reason)

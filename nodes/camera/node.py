@@ -15,7 +15,7 @@ from semantic_mapper.nodes.camera.listeners import START_S, drain, wait_for_list
 from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions
-from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, play
+from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, frames_to_play, play
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.codec import Envelope
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
@@ -46,6 +46,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
     play_options = PlayOptions(
         mode=options.mode,
         rate=options.rate,
+        loop=options.loop,
         max_frames=options.max_frames or None,
         subscribers=context.subscribers,
         subscriber_timeout_s=START_S,
@@ -68,7 +69,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
             if not wait_for_listeners(context, publisher, acks):
                 _log.info("played", published=0, stopped=True)
                 return
-            bar = stack.enter_context(frame_progress("played", min(len(log), options.max_frames or len(log))))
+            bar = stack.enter_context(frame_progress("played", frames_to_play(log, play_options)))
             playback = Playback(context, options.rate)
 
             def on_frame(envelope: Envelope) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
@@ -13,7 +14,7 @@ import msgspec
 from semantic_mapper.errors import CodecError, LogError, NodeError, TransportError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.sequence import Log
-from semantic_mapper.transport.codec import Envelope, decode_as, encode
+from semantic_mapper.transport.codec import Envelope, decode_as, encode, retaken
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -23,6 +24,7 @@ Mode = Literal["lockstep", "realtime", "fast"]
 ACK_TOPICS = ("map", "refused")  # what a lockstep subscriber has to subscribe to
 END_TIMEOUT_S = 60.0  # a lossless mapper behind a full queue needs the time of one frame to make room for the end
 STOP_TIMEOUT_S = 5.0  # ... but who presses Ctrl-C does not want to wait for a mapper that hangs
+ALONE_NS = 1_000_000_000  # between two showings of a log with one frame
 _SLICE_S = 0.1
 
 logger = get_logger(__name__)
@@ -36,6 +38,7 @@ class PlayOptions:
     # "fast": as fast as the subscribers take frames (with a publisher of policy "block", nothing is lost)
     mode: Mode = "lockstep"
     rate: float = 1.0  # of "realtime"; 2 = twice as fast
+    loop: bool = False  # begin again after the last frame: stamps and numbers go on, labels come the first time only
     max_frames: int | None = None  # stop after this many; None = all
     subscribers: int = 1  # wait for this many before the first frame
     subscriber_timeout_s: float = 60.0  # how long to wait for them
@@ -80,7 +83,7 @@ def play(
     options, stop = options or PlayOptions(), stop or threading.Event()
     if options.mode == "lockstep" and acks is None:
         raise NodeError("lockstep needs the mapper's answers: give the player a subscriber to them")
-    total = len(log) if options.max_frames is None else min(len(log), options.max_frames)
+    total = frames_to_play(log, options)
     publisher.wait_for_subscribers("frame", options.subscribers, options.subscriber_timeout_s)
     if acks is not None:
         acks.wait_until_heard(options.subscriber_timeout_s)
@@ -98,7 +101,8 @@ def play(
             try:  # a subscriber would drop what it cannot decode, and lockstep would wait for its answer for ever
                 decode_as(PosedFrame, parts)
             except CodecError as error:
-                undecodable.append(LogError(f"{log.path}: frame seq={envelope.seq}: {error}"))
+                if len(undecodable) < len(log):  # in a loop, each one comes again
+                    undecodable.append(LogError(f"{log.path}: frame seq={envelope.seq}: {error}"))
                 continue
             publisher.publish(parts, options.ack_timeout_s)
             if options.mode == "lockstep" and acks is not None:
@@ -122,10 +126,35 @@ def play(
     return PlayReport(published, tuple(log.errors + undecodable), stop.is_set())
 
 
+def frames_to_play(log: Log, options: PlayOptions) -> int | None:
+    """How many frames are played unless somebody ends it early; None = without end."""
+    if options.loop:
+        return options.max_frames
+    return len(log) if options.max_frames is None else min(len(log), options.max_frames)
+
+
+def _looped(log: Log, from_stamp_ns: int) -> Iterator[tuple[Envelope, list[bytes]]]:
+    """The frames of a log again and again, without the labels from the second time on: each is there to be scored, or
+    learned from, once. Loops that end before ``from_stamp_ns`` may be left out."""
+    stamps, next_seq = list[int](), 0
+    for envelope, parts in log.frame_parts():
+        stamps.append(envelope.stamp_ns)
+        next_seq = max(next_seq, envelope.seq + 1)
+        yield envelope, parts
+    if not stamps:
+        return
+    length_ns = max(stamps) - min(stamps)
+    period_ns = length_ns + (length_ns // max(len(stamps) - 1, 1) or ALONE_NS)
+    for number in itertools.count(max(1, (from_stamp_ns - max(stamps)) // period_ns)):
+        for envelope, parts in log.frame_parts():
+            stamp_ns, seq = envelope.stamp_ns + number * period_ns, envelope.seq + number * next_seq
+            yield replace(envelope, stamp_ns=stamp_ns, seq=seq, has_label=False), retaken(parts, stamp_ns, seq)
+
+
 def _due_frames(log: Log, options: PlayOptions, stop: threading.Event) -> Iterator[tuple[Envelope, list[bytes]]]:
     """Frames when they are to be sent, until ``stop``."""
     began: tuple[float, int] | None = None  # clock and stamp at the first frame
-    for envelope, parts in log.frame_parts():
+    for envelope, parts in _looped(log, options.from_stamp_ns) if options.loop else log.frame_parts():
         if envelope.stamp_ns < options.from_stamp_ns:
             continue
         if options.mode == "realtime":  # keep the distances in time of the recording

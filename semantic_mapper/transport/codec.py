@@ -343,6 +343,11 @@ def with_label(parts: Parts, pseudo_label: UInt8 | None) -> list[bytes]:
     return _with_images(parts, packed, without="label", pseudo_label=pseudo_label is not None)
 
 
+def retaken(parts: Parts, stamp_ns: int, seq: int) -> list[bytes]:
+    """A frame as of another capture, without labels; all else stays, byte for byte."""
+    return _with_images(parts, {}, without="label", pseudo_label=False, stamp_ns=stamp_ns, seq=seq)
+
+
 def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> list[bytes]:
     """A frame with computed depth (H, W) and its one-sigma spread, in metres; all else stays, byte for byte."""
     scale = _DEFAULTS.depth_scale

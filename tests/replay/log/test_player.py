@@ -142,9 +142,17 @@ def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: s
     assert isinstance(end, EndOfStream) and end.unreadable == 1 and "seq=1" in end.damages[0]
 
 
-@pytest.mark.parametrize("options", [PlayOptions("fast", max_frames=7), PlayOptions("realtime", 1e3, max_frames=7)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        PlayOptions("fast", max_frames=7),
+        PlayOptions("realtime", 1e3, max_frames=7),
+        PlayOptions("realtime", 1e3, loop=True, max_frames=30),
+        PlayOptions("fast", loop=True, max_frames=30, from_stamp_ns=samples.make_frame(500).stamp_ns),
+    ],
+)
 def test_playing_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoint: str, options: PlayOptions) -> None:
-    seqs: list[int] = []
+    frames: list[PosedFrame] = []
     with (
         LogReader(small_log) as reader,
         Publisher(endpoint, policy="block", hwm=1) as publisher,
@@ -153,9 +161,13 @@ def test_playing_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoin
         thread = threading.Thread(target=lambda: play(reader, publisher, None, options))
         thread.start()
         while isinstance(message := subscriber.receive(WAIT_S), PosedFrame):
-            seqs.append(message.seq)
+            frames.append(message)
         thread.join()
-    assert seqs == list(range(7)) and isinstance(message, EndOfStream)
+    first = 500 if options.from_stamp_ns else 0
+    assert [f.seq for f in frames] == list(range(first, first + (options.max_frames or 0)))
+    assert isinstance(message, EndOfStream)
+    assert [f.stamp_ns for f in frames] == [samples.make_frame(f.seq).stamp_ns for f in frames], "time never goes back"
+    assert [f.label is not None for f in frames] == [f.seq < FRAMES for f in frames]
 
 
 def test_playing_can_be_stopped(small_log: Path, endpoint: str) -> None:
