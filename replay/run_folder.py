@@ -97,7 +97,7 @@ def map_path(path: Path) -> Path:
     maps = [*sorted(path.glob(f"*{MAP_SUFFIX}")), *sorted(path.glob(f"*/{MAP_NAME}"))]
     hint = f"name the map itself, such as {maps[0]}" if maps else "give a saved map or a folder of `map`"
     if (path / STORE_MARK).is_file():
-        hint = "a fleet's store: `fleet merge` fuses its maps; or name one of them in files/"
+        hint = "a fleet's store: `merge` makes one map of its maps; or name one of them in files/"
     raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {hint}")
 
 

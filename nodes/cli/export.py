@@ -10,10 +10,11 @@ import typer
 from semantic_mapper.config import Fraction, NotNegative
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
-from semantic_mapper.mapping.map_alignment import check_mergeable, find_alignment
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.verb import UpOption, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, UpOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
+from semantic_mapper.nodes.fleet.store import is_url
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.exporters import export_log, log_format_of
 from semantic_mapper.replay.exporters.map_files import (
@@ -21,7 +22,6 @@ from semantic_mapper.replay.exporters.map_files import (
     Format,
     export_map,
     format_of,
-    parse_transform,
     parse_up,
 )
 from semantic_mapper.replay.exporters.run import LogFormat
@@ -99,36 +99,32 @@ def export_recording(output: Output, source: Path, out: Path, name: LogFormat, c
 
 @verb
 def merge(
-    output: Output,
-    a: Path,  # saved map, or a folder of results with one
-    b: Path,  # another one of the same voxel size and classes
+    output: JsonOutput,
+    maps: list[str],  # saved maps, folders with one, stores of `fleet run map`, or URLs of these
     *,
-    out: Path,  # map to write (.npz), in the frame of A
-    # where B lies in A: "x y z yaw_deg" (metres; about +z), or a file with T_A_B, 4 rows of 4; "find" = look for it by
-    # what both maps show
-    transform: str = "find",
+    out: Path,  # map to write (.npz)
+    # JSON: an object of [x, y, z, yaw_deg] or 4 rows of 4 by names of maps; poses of others are found by what they show
+    poses: Path | None = None,
 ) -> None:
-    """Make one map of two: what both have measured adds up.
+    """Make one map of several: what all have measured adds up.
 
-    Where B lies in A is found by the features that both maps keep, and refused where it is uncertain. Shifts
-    by whole voxels are exact; for others, B's voxels are interpolated. Settings are those of A.
+    Where a map lies is found by the features that maps keep, and refused where it is uncertain. The world is that of
+    the first map, or of --poses. Shifts by whole voxels are exact; for others, voxels are interpolated. A map is named
+    by its log, its file or its folder. Settings are those of the first map; what does not fit in memory goes to disk.
 
-    Example: semantic-mapper merge runs/east runs/west --out house.npz
-    Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
+    Example: semantic-mapper merge runs/east runs/west runs/attic --out house.npz
+    Example: semantic-mapper merge runs/fleet --poses poses.json --out house.npz
     """
-    T_a_b = None if transform == "find" else parse_transform(transform)
-    sources = map_path(a), map_path(b)
-    refuse_overwriting(out, *sources)
+    given = {} if poses is None else read_poses(poses)
+    sources = find_maps(maps)
+    refuse_overwriting(out, *(Path(source) for source in sources.values() if not is_url(source)))
     prepare_file(out)
-    check_mergeable(*sources, find=T_a_b is None)
-    one, other = map(VoxelMap.load, sources)
-    if T_a_b is None:
-        found = find_alignment(one, other)
-        output.print(f"{found.agreeing} of {found.looked_for} places of B are at one on where it lies in A, T_A_B:")
-        for row in found.T_map_other:
-            output.print("  " + " ".join(f"{value:9.4f}" for value in row))
-        T_a_b = found.T_map_other
-    joined = one.merged(other, T_a_b)
-    joined.save(out)
-    blocks = f"{one.block_count} and {other.block_count} made {joined.block_count} blocks"
-    output.print(f"{out}: {counted(joined.frames, 'frame')}; {blocks}")
+    with frame_progress("merge", len(sources), unit="maps") as bar:
+        report = merge_maps(sources, given, bar.advance)
+        report.merged.save(out)
+    frames, blocks = report.merged.frames, report.merged.block_count
+    found = {name: T.tolist() for name, T in report.poses.items()}
+    output.json({"map": str(out), "poses": found, "frames": frames, "blocks": blocks})
+    for note in report.notes:
+        output.print(note)
+    output.print(f"{out}: {counted(len(sources), 'map')}, {counted(frames, 'frame')}, {counted(blocks, 'block')}")

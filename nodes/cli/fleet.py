@@ -30,7 +30,7 @@ MAX_LOGS = 40
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Map, score, label, finetune and merge many logs, on this machine or a Ray cluster.",
+    help="Map, score, label and finetune many logs, on this machine or a Ray cluster.",
 )
 
 
@@ -169,40 +169,6 @@ def compare(
     output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
     _show_comparison(output, found)
     return EXIT_FAILED if found.reasons else 0
-
-
-@app.command()
-@verb
-def merge(
-    output: JsonOutput,
-    maps: list[str],  # stores with replays, saved maps, folders with one, or URLs of these
-    *,
-    out: Path,  # map to write (.npz)
-    # JSON: an object of [x, y, z, yaw_deg] or 4 rows of 4 by names of maps; poses of others are found by what they show
-    poses: Path | None = None,
-) -> None:
-    """Fuse maps of one building into one map, which keeps what does not fit in memory on disk.
-
-    All that the maps have measured adds up, in the world of the first map or of --poses, as `merge` does for two; it
-    is refused where a map fits nowhere. A map is named by its log, its file or its folder.
-
-    Example: semantic-mapper fleet merge runs/east runs/west runs/attic --out house.npz
-    Example: semantic-mapper fleet merge runs/fleet --poses poses.json --out house.npz
-    """
-    from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
-
-    given = {} if poses is None else read_poses(poses)
-    sources = find_maps(maps)
-    prepare_file(out)
-    with frame_progress("merge", len(sources), unit="maps") as bar:
-        report = merge_maps(sources, given, bar.advance)
-        report.merged.save(out)
-    frames, blocks = report.merged.frames, report.merged.block_count
-    found = {name: T.tolist() for name, T in report.poses.items()}
-    output.json({"map": str(out), "poses": found, "frames": frames, "blocks": blocks})
-    for note in report.notes:
-        output.print(note)
-    output.print(f"{out}: {counted(len(sources), 'map')}, {counted(frames, 'frame')}, {counted(blocks, 'block')}")
 
 
 def _shown(rows: Rows) -> Table:

@@ -25,7 +25,7 @@ VERBS: Mapping[str, tuple[str, str]] = {
     "import": ("importing:import_", "Make a log of a recording of another program, of a film, or of a damaged log."),
     "info": ("info:info", "Say what a log, a map or a file of boxes holds, or which weights a mapper uses."),
     "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
-    "merge": ("export:merge", "Make one map of two: what both have measured adds up."),
+    "merge": ("export:merge", "Make one map of several: what all have measured adds up."),
     "query": ("query:query", "Ask a saved map, or that of a running mapper, what is where."),
     "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),
     "finetune": ("finetune:finetune", "Fit the field to a few labelled keyframes of a log."),
@@ -36,7 +36,7 @@ VERBS: Mapping[str, tuple[str, str]] = {
         "Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML.",
     ),
     "bench": ("bench:bench", "Measure speed on this machine, on frames of 640x480."),
-    "fleet": ("fleet:app", "Map, score, label, finetune and merge many logs, on this machine or a Ray cluster."),
+    "fleet": ("fleet:app", "Map, score, label and finetune many logs, on this machine or a Ray cluster."),
     "keys": ("keys:keys", "Make, show or exchange the keys by which machines know each other."),
     "doctor": ("doctor:doctor", "Look for what this machine lacks, with a fix for each thing; or list its cameras."),
 }

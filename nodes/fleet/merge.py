@@ -13,18 +13,18 @@ import numpy as np
 
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.geometry import check_pose, yaw_transform
+from semantic_mapper.geometry import check_pose, rotation_vector, yaw_transform
 from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_file import MapManifest, describe_map
+from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, fetch, is_store, is_url
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX, map_path
 from semantic_mapper.types import Float64
 
 MEMORY_MB = 1000  # of the merged map, and of the one that is added to it
 _MAX_BLOCKS = 1 << 27
-_WAY_OUT = "Give its pose in the file of --poses"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,9 +70,13 @@ def merge_maps(
                     if name in known:
                         T_world_map, note = known[name], "pose as given" if given else "the world is its own"
                     else:
-                        found = find_alignment(whole, loaded, _WAY_OUT)
+                        found = find_alignment(whole, loaded)
                         T_world_map = found.T_map_other
-                        note = f"{found.agreeing} of {found.looked_for} places found in the maps before it"
+                        where, turn = T_world_map[:3, 3], np.degrees(np.linalg.norm(rotation_vector(T_world_map)))
+                        note = (
+                            f"{found.agreeing} of {found.looked_for} places found in the maps before it; at "
+                            f"({where[0]:.2f}, {where[1]:.2f}, {where[2]:.2f}), turned by {turn:.1f} degrees"
+                        )
                     whole.add(loaded, T_world_map)
                 except MapError as error:
                     refused[name] = str(error)
@@ -92,7 +96,7 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
     that it was made of; by the path or URL itself where two have the same name.
 
     Arguments are paths or URLs of map files, of folders with a ``map.npz``, or of stores: the latest replay of each of
-    its logs. Raises ConfigError: fewer than two maps, or no such file. StoreError: a store cannot be reached.
+    its logs. Raises ConfigError: fewer than two maps, or no such map. StoreError: a store cannot be reached.
     """
     found: list[tuple[str, str]] = []
     for argument in arguments:
@@ -102,10 +106,10 @@ def find_maps(arguments: Sequence[str]) -> dict[str, str]:
             latest = {result.log_digest: result for result in replays}.values()
             found += sorted((_stem(r.log), f"{store.url}/{r.folder}/{MAP_NAME}") for r in latest)
             continue
-        url = argument if is_url(argument) else str(Path(argument).absolute())
-        url = url if url.endswith(MAP_SUFFIX) else f"{url.rstrip('/')}/{MAP_NAME}"
-        if not is_url(url) and not Path(url).is_file():
-            raise ConfigError(f"{argument}: no such map file, and no folder with a {MAP_NAME}")
+        if not is_url(argument):
+            url = str(map_path(Path(argument)).absolute())
+        else:
+            url = argument if argument.endswith(MAP_SUFFIX) else f"{argument.rstrip('/')}/{MAP_NAME}"
         found.append((_stem(url.removesuffix(f"/{MAP_NAME}")), url))
     stems = [stem for stem, _ in found]
     named = {stem if stems.count(stem) == 1 else without_secrets(url): url for stem, url in found}
@@ -135,13 +139,15 @@ def read_poses(path: Path) -> dict[str, Float64]:
 
 
 def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
-    """With the settings of the first map and room for all. Raises MapError: two maps are the same."""
+    """With the settings of the first map and room for all. Raises MapError: two maps are the same, or only some are in
+    metres."""
     seen: dict[bytes, str] = {}
+    first_name, first = next(iter(manifests.items()))
     for name, manifest in manifests.items():
+        require_same_scale(first.scale_known, manifest.scale_known, f"{first_name} and {name}")
         chunks = msgspec.json.encode(manifest.chunks)
         if manifest.chunks and (twin := seen.setdefault(chunks, name)) != name:
             raise MapError(f"{twin} and {name} are the same map: all that it has seen would count twice")
-    first = next(iter(manifests.values()))
     # A block that is turned reaches into at most 8 others.
     blocks = min(8 * sum(manifest.blocks for manifest in manifests.values()), _MAX_BLOCKS)
     config = msgspec.structs.replace(

@@ -202,6 +202,8 @@ class Store:
 
 def is_store(url: str) -> bool:
     """Whether a path or URL names a store."""
+    if not is_url(url):
+        return Path(url, STORE_MARK).is_file()
     fs, path = open_url(url)
     with reaching(url):
         return bool(fs.exists(f"{path}/{STORE_MARK}"))
@@ -264,6 +266,8 @@ def full_url(fs: Any, path: str, like: str) -> str:
 
 def fetch(url: str, target: Path) -> Path:
     """A file on this machine: ``target``, to which it is downloaded, where it is elsewhere."""
+    if not is_url(url):
+        return Path(url)
     fs, path = open_url(url)
     if "file" in fs.protocol:
         return Path(path)

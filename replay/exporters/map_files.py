@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from semantic_mapper.config import read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
-from semantic_mapper.geometry import check_pose, yaw_transform
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
 from semantic_mapper.mapping.formats import (
@@ -83,25 +82,6 @@ class ExportReport:
 def format_of(path: Path, given: str | None) -> Format:
     """See ``choose_format``."""
     return choose_format(path, given, SUFFIXES, FORMATS)
-
-
-def parse_transform(text: str) -> Float64:
-    """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
-
-    Raises ConfigError: neither of these. PoseError: the file holds something else than a rigid transform.
-    """
-    numbers = _numbers(text)
-    if numbers is not None and numbers.shape == (4,):
-        return yaw_transform(numbers[:3], float(numbers[3]))
-    try:
-        T = np.loadtxt(Path(text), dtype=np.float64).reshape(4, 4)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--transform {text}: expected four numbers, x y z in metres and yaw in degrees, or a file with 4 rows of "
-            f"4 numbers: {error}"
-        ) from error
-    check_pose(T, text)
-    return T
 
 
 def parse_up(text: str) -> Float64 | None:

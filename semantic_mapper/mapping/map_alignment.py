@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from semantic_mapper.localization.relocalizer import (
     sighting,
 )
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.merge import check_fit
 from semantic_mapper.mapping.open3d_loader import load_open3d
@@ -35,7 +33,7 @@ _NEAR_M = (0.06, 0.03)  # of two surfaces that are taken for one, at first and t
 _POINTS = 300_000  # of the other map, at most
 _ROUNDS = 50
 _VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
-_WAY_OUT = 'Give it: --transform "x y z yaw_deg", or "0 0 0 0" where both are in one world'
+_WAY_OUT = 'Give their poses: --poses FILE, with {"NAME": [x, y, z, yaw_deg], ...}; all 0 where they are in one world'
 
 _log = get_logger(__name__)
 
@@ -49,36 +47,22 @@ class MapAlignment:
     looked_for: int  # of so many
 
 
-def check_mergeable(path: Path, other: Path, *, find: bool) -> None:
-    """Refuse two saved maps without reading their blocks; ``find``: where the second lies in the first is to be found.
-
-    ``MapError``: only one is in metres, they are the same map, what is to be found cannot be; or one cannot be read."""
-    with open_map(path) as one, open_map(other) as two:
-        manifests = one.manifest, two.manifest
-    require_same_scale(manifests[0].scale_known, manifests[1].scale_known, "merge")
-    if manifests[0].chunks and manifests[0].chunks == manifests[1].chunks:
-        raise MapError(f"{path} and {other} are the same map: all that it has seen would count twice")
-    for manifest, which in zip(manifests, ("first", "second"), strict=True):
-        if find and not (manifest.places and manifest.places.places):
-            raise MapError(_nothing_to_find(which))
-
-
-def _nothing_to_find(which: str, way_out: str = _WAY_OUT) -> str:
+def _nothing_to_find(which: str) -> str:
     return (
         f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, or "
-        f"with keyframes.save_places = false). {way_out}"
+        f"with keyframes.save_places = false). {_WAY_OUT}"
     )
 
 
-def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT) -> MapAlignment:
-    """Where another map lies in this one; ``way_out`` is what errors advise where it cannot be found.
+def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
+    """Where another map lies in this one.
 
     ``MapError`` says why: the maps do not fit each other, nothing is found, or not for sure."""
     check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(_nothing_to_find(which, way_out))
+            raise MapError(_nothing_to_find(which))
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
     looks = [(place, _find(finder, other, place)) for place in chosen]
@@ -88,7 +72,7 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap, way_out: str = _WAY_OUT
         refused = ", ".join(sorted({found.reason for _, found in looks if isinstance(found, NotFound)}))
         raise MapError(
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
-            f"first ({refused or 'none was refused'}), and {consensus.refusal}. {way_out}"
+            f"first ({refused or 'none was refused'}), and {consensus.refusal}. {_WAY_OUT}"
         )
     T = agreed(consensus.agreeing)
     refined = _refine(voxel_map, other, T)

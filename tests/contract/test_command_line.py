@@ -51,8 +51,8 @@ COMMANDS: dict[str, str] = {
     "export a log as mesh": "export {log} --out {tmp}/log.glb",
     "export to an unknown format": "export {map} --out {tmp}/map.stl",
     "export without a file": "export {map}",
-    "merge": "merge {map} {coarse} --transform 1.2|0|0|90 --out {tmp}/both.npz",
-    "merge a map with itself": "merge {map} {stored} --transform 0|0|0|0 --out {tmp}/no.npz",
+    "merge": "merge {map} {coarse} --poses {poses} --out {tmp}/both.npz",
+    "merge a map with itself": "merge {map} {stored} --out {tmp}/no.npz",
     "merge maps of other voxels": "merge {map} {tmp}/none.npz --out {tmp}/no.npz",
     "compare equal runs": "compare {stored} {map} --json",
     "compare other runs": "compare {map} {coarse}",
@@ -179,10 +179,13 @@ def make_places(folder: Path) -> dict[str, str]:
     data[len(data) // 2] ^= 0xFF
     (folder / "damaged.mcap").write_bytes(data)
     (folder / "wrong.toml").write_text("[voxel_map]\nvoxel_sise_m = 0.1\n")
+    (folder / "poses.json").write_text('{"stored": [0, 0, 0, 0], "coarse": [1.2, 0, 0, 90]}')
     stored = folder / "stored"  # commands that would write there by mistake must not reach golden files
     shutil.copytree(STORED, stored)
     shutil.copyfile(MAP_COARSE, folder / "coarse.npz")
-    made = {"cut": "cut.mcap", "damaged": "damaged.mcap", "wrong": "wrong.toml", "coarse": "coarse.npz"}
+    made = {"cut": "cut.mcap", "damaged": "damaged.mcap", "wrong": "wrong.toml", "coarse": "coarse.npz"} | {
+        "poses": "poses.json"
+    }
     given = {"log": LOG, "map": stored / MAP.name, "stored": stored, "weights": WEIGHTS, "tmp": folder}
     given["corrections"] = LOG.parent / "corrections.tum"
     return {name: str(path) for name, path in ({n: folder / f for n, f in made.items()} | given).items()}

@@ -182,7 +182,7 @@ FORMS = (
         "fleet table {}",
         "fleet compare {} {}",
         "fleet run map {} --out store",
-        "fleet merge {} a.npz --out store.npz",
+        "merge {} a.npz --out store.npz",
         "map {} --out out",
         "import {} a.mcap",
         "info {}",

@@ -17,7 +17,7 @@ from semantic_mapper.replay.run_folder import map_path
         ("kitchen.mcap", "is a log; `semantic-mapper map"),
         ("kitchen.npz", "name the map itself, such as"),
         ("run1/map.npz", "name the map itself, such as"),
-        ("fleet.json", "a fleet's store: `fleet merge` fuses its maps"),
+        ("fleet.json", "a fleet's store: `merge` makes one map of its maps"),
     ],
 )
 def test_a_folder_without_a_map_says_what_is_in_it(tmp_path: Path, file: str, says: str) -> None:

@@ -28,7 +28,7 @@ from tests.mapping.rendered_views import small_map
 from tests.mapping.test_merge import fuse_views, turned
 from tests.mapping.test_voxel_map import same
 from tests.nodes.fleet.made_up import made_up, store_of
-from tests.nodes.support import run_ok
+from tests.nodes.support import refused, run_ok
 
 DEMO = Path(semantic_mapper.__file__).parent / "demo.mcap"
 POSES = {"a": np.eye(4), "b": turned((0, 0, 30), (0.31, -1.27, 0.553)), "c": turned((0, 0, 0), (0.26, -0.06, 0.80))}
@@ -114,7 +114,7 @@ def test_maps_that_cannot_be_merged_are_refused(maps: list[str], tmp_path: Path)
         (MapError, r"cannot be added; .*: b: .*nothing to find", maps, {"a": np.eye(4), "c": POSES["c"]}),
         (MapError, "b: both maps were made with the same frames", [f"{tmp_path}/a.npz", f"{tmp_path}/b.npz"], {}),
         (ConfigError, "--poses names d, but the maps are a, b, c", maps, {"d": np.eye(4)}),
-        (ConfigError, "no such map file", [*maps, str(tmp_path / "none.npz")], POSES),
+        (ConfigError, "no such map file or folder", [*maps, str(tmp_path / "none.npz")], POSES),
         (ConfigError, "two maps or more; these are: none", [store_of(tmp_path / "store").url], POSES),
     ):
         with pytest.raises(error, match=said):
@@ -133,6 +133,9 @@ def test_maps_that_cannot_be_merged_are_refused(maps: list[str], tmp_path: Path)
 def test_the_command_merges_and_query_reads(maps: list[str], tmp_path: Path) -> None:
     poses, out = tmp_path / "poses.json", tmp_path / "house.npz"
     poses.write_text(json.dumps({"a": [0, 0, 0, 0], "b": POSES["b"].tolist(), "c": [0.26, -0.06, 0.8, 0]}))
-    said = run_ok("fleet", "merge", *maps, "--out", out, "--poses", poses).stdout
+    said = run_ok("merge", *maps, "--out", out, "--poses", poses).stdout
     assert "b: pose as given" in said and "3 maps, 12 frames" in said
     assert "12" in run_ok("query", out, "info").stdout
+    before = Path(maps[0], "map.npz").read_bytes()
+    assert "the result is made from it" in refused("merge", *maps, "--out", Path(maps[0], "map.npz"), "--poses", poses)
+    assert Path(maps[0], "map.npz").read_bytes() == before
