@@ -135,7 +135,7 @@ class FrameProgress(JobMonitor):
     def __init__(self, progress: Progress, what: str, total: int | None, unit: str, stop: StopRequest | None) -> None:
         self._progress = progress
         self._task = progress.add_task(what, total=total, note="", rate="")
-        self._what, self._total, self._unit = what, total, unit
+        self._what, self._stage, self._total, self._unit = what, "", total, unit
         self._stop = stop
         self._done = 0
         self._began = self._reported = time.monotonic()
@@ -145,11 +145,13 @@ class FrameProgress(JobMonitor):
         """The signal that asks for an early end; empty = none has come."""
         return self._stop.name if self._stop is not None else ""
 
-    def start(self, total: int | None) -> None:
-        """Now it is known how many there are, and work begins."""
-        self._total = total
+    def start(self, total: int | None, stage: str = "") -> None:
+        """Now it is known how many there are, and work begins, or a stage of it with a name of its own."""
+        self._total, self._stage = total, stage
         self._began = self._reported = time.monotonic()
-        self._progress.reset(self._task, total=total, description=self._what)
+        self._progress.reset(self._task, total=total, description=stage or self._what, rate="", note="")
+        if stage and not self._progress.console.is_terminal:
+            _log.info(stage, total=total)
 
     def advance(self, count: int = 1) -> None:
         """This many more are done."""
@@ -160,11 +162,11 @@ class FrameProgress(JobMonitor):
         self._done = done
         now = time.monotonic()
         rate = f"{done / max(now - self._began, 1e-9):.2f} {self._unit}/s"
-        more: dict[str, Any] = {"rate": rate} | ({"note": note} if note else {})
+        more: dict[str, Any] = ({} if self._stage else {"rate": rate}) | ({"note": note} if note else {})
         self._progress.update(self._task, completed=done, **more)
         if not self._progress.console.is_terminal and now - self._reported >= LOG_PERIOD_S:
             self._reported = now
-            _log.info(self._what, done=done, total=self._total, **more)
+            _log.info(self._stage or self._what, done=done, total=self._total, **more)
 
 
 @contextmanager

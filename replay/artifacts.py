@@ -7,6 +7,7 @@ import platform
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from importlib import metadata
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.formats import write_ply
+from semantic_mapper.mapping.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scale_name, voxel_size_text
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
@@ -102,6 +104,11 @@ def finish_session(
     _write_report(session, points, overview, up, unit, summary, out)
     progress()
     return summary
+
+
+def result_steps(session: MapSession) -> int:
+    """About how often ``finish_session`` calls ``progress``."""
+    return 7 + (session.rerun is not None) + ceil(session.pipeline.voxel_map.block_count / CHUNK_BLOCKS)
 
 
 def clear_results(out: Path) -> None:

@@ -11,8 +11,9 @@ class JobMonitor:
         """The signal that asks for an early end; empty = none has come. Looked at before every frame."""
         return ""
 
-    def start(self, total: int | None) -> None:
-        """A stage of so many units of work begins; None where nobody knows how many."""
+    def start(self, total: int | None, stage: str = "") -> None:
+        """A stage of so many units of work begins; None where nobody knows how many. ``stage`` names it where its units
+        are not those of the job."""
 
     def set(self, done: int, note: str = "") -> None:
         """So many units are done; ``note`` says what is being done."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.refine import RefineReport, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted
-from semantic_mapper.replay.artifacts import clear_results, finish_session
+from semantic_mapper.replay.artifacts import clear_results, finish_session, result_steps
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.evaluate import methods
@@ -103,7 +104,9 @@ def replay_log(
         except SemanticMapperError:  # the map is full, for one: what is in it is worth keeping
             finish_session(session, out, "error")
             raise
-        summary = finish_session(session, out, monitor.stopped_by)
+        monitor.start(result_steps(session), "write the results")
+        written = count(1)
+        summary = finish_session(session, out, monitor.stopped_by, progress=lambda: monitor.set(next(written)))
     if not session.fused:
         empty = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
         reason = f"the first: {session.refusals.first[0].reason}" if session.refusals else empty
