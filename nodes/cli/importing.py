@@ -87,8 +87,8 @@ def import_(
     log: Path,  # log to write (.mcap)
     options: SourceOptions,
     *,
-    # folder, tum, scannet, replica, 7-scenes, kitti360, rosbag, polycam, record3d, transforms, colmap, opensfm
-    # [found out]
+    # folder, tum, icl, scannet, replica, nice-slam, 7-scenes, kitti360, rosbag, polycam, record3d, transforms,
+    # colmap, opensfm [found out]
     format_: str | None = None,
     max_frames: MaxFramesOption = 0,
     every: AtLeastOne = 1,  # only every N-th frame
@@ -104,7 +104,7 @@ def import_(
 
     Frames that cannot be used are left out, with the reason. --rotate is for cameras mounted on their side. Poses of a
     film or a folder of pictures are found; its lengths are metres by GPS of the pictures or by one of --scale,
-    --distance, --square-mm, --camera-height. Of a damaged log every intact message is kept. See docs/recordings.md.
+    --distance, --square-mm, --camera-height. Of a damaged log every intact message is kept. See docs/layouts.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
@@ -215,9 +215,9 @@ def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, 
         def show(what: str, done: int, total: int) -> None:
             nonlocal stage
             if what != stage:
-                bar.start(total)
+                bar.start(total, _STAGES.get(what, what))
                 stage = what
-            bar.set(done, _STAGES.get(what, what))
+            bar.set(done)
 
         report = import_film(source, log, options, show, overwrite=overwrite)
     frames, megabytes = len(report.T_world_camera), log.stat().st_size / 1e6

@@ -1,11 +1,4 @@
-"""The sequence-folder layout.
-
-``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
-``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx
-cy; of images that are not rectified, distortion: OpenCV's coefficients, with ``"fisheye": true`` those of its fisheye
-model; unless depth is in millimetres, depth_scale: units per metre;
-``"scale": "unknown"`` where poses are not in metres), and, if there is one, ``timestamps.txt`` (a row a frame: int
-nanoseconds, seconds with a point, or date and time). A frame may lack depth and label.
+"""The sequence folder. A frame may lack depth and label.
 
 ``export`` also writes ``pseudo_label/NNNNNN.png``, labels that weights have rendered, and ``computed_depth/NNNNNN.png``
 with its one-sigma spread in ``depth_sigma/NNNNNN.png``: they come back with that mark, for frames without the other.

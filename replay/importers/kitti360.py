@@ -1,15 +1,10 @@
 """KITTI-360: one drive, its two rectified perspective cameras, and the depth that its laser scanner gives them.
 
 The layout is that of https://www.cvlibs.net/datasets/kitti-360/documentation.php ("Folder Structure", "Calibration",
-"Camera Poses"): under the root, ``calibration/perspective.txt`` (``P_rect_0x`` 3x4, ``S_rect_0x`` width height),
-``data_2d_raw/DRIVE/image_0x/data_rect/NNNNNNNNNN.png`` and ``image_0x/timestamps.txt`` (a row a frame),
-``data_poses/DRIVE/cam0_to_world.txt`` (frame number and the 16 numbers of ``T_world_camera`` of the rectified left
-camera; not every frame has one), and, for drives that are labelled,
-``data_2d_semantics/train/DRIVE/image_0x/semantic/NNNNNNNNNN.png`` (uint8 ids). Depth comes from
-``data_3d_raw/DRIVE/velodyne_points/data/NNNNNNNNNN.bin`` (float32 x y z reflectance a point, in the scanner's axes),
-where it is there, by way of ``calibration/calib_cam_to_velo.txt`` (3x4, unrectified left camera -> scanner) and
-``R_rect_00``. The scanner reaches 2 degrees above the horizon; its scans are not corrected for the car's motion.
-DRIVE is ``2013_05_28_drive_0000_sync`` and the like; give the root where it holds one, else ``data_2d_raw/DRIVE``.
+"Camera Poses"). ``cam0_to_world.txt`` has ``T_world_camera`` of the rectified left camera; not every frame has one.
+Depth comes from the laser scans (float32 x y z reflectance a point, in the scanner's axes), where they are there, by
+way of ``calib_cam_to_velo.txt`` (3x4, unrectified left camera -> scanner) and ``R_rect_00``. The scanner reaches 2
+degrees above the horizon; its scans are not corrected for the car's motion.
 
 Class ids, names and colours are those of ``kitti360scripts/helpers/labels.py`` in
 https://github.com/autonomousvision/kitti360Scripts, but for its category "void", which is read as unknown.

@@ -3,8 +3,6 @@
 Where the pictures have GPS positions, these tell scale, up and north. Otherwise up is how the camera was held, and the
 unit is the model's own, unless a scale is given; without one, the median depth of the points becomes 2 units.
 
-COLMAP's models, text and binary, have their pictures in ``images`` next to ``sparse`` (or to the model).
-
 OpenSfM's ``reconstruction.json`` has the layout of https://opensfm.org/docs/dataset.html. Pixels count from the
 picture's middle, divided by its longer side. Poses are world to camera, rotations as axis times angle, camera axes are
 OpenCV's. With a ``reference_lla`` that is not zero OpenSfM has aligned the model by GPS: then x is east, y north, z up,

@@ -1,14 +1,11 @@
 """Exports of iPhones and iPads: Polycam's raw data, and Record3D's "EXR + RGB". Both have ARKit's world, where y is up,
 and OpenGL's camera axes.
 
-Polycam's developer mode writes, as https://github.com/PolyCam/polyform says ("Polycam's data format"), below
-``keyframes``: ``corrected_images`` and ``corrected_cameras`` (else ``images`` and ``cameras``, as ARKit gave them),
-``depth`` (16-bit PNG, millimetres, smaller than the pictures) and ``confidence`` (8 bits, 0 = low). Files are named by
-the time of capture in microseconds. ``t_ij`` is camera to world.
+Polycam's layout is that of https://github.com/PolyCam/polyform ("Polycam's data format"): ``t_ij`` is camera to world;
+without corrected pictures and cameras there are ``images`` and ``cameras``, as ARKit gave them.
 
-Record3D writes ``rgb/N.jpg`` (or .png) and ``metadata.json`` with ``K`` (9 numbers, column by column) for pictures of
-``w`` x ``h``, ``fps``, and ``poses``, one for each picture: qx qy qz qw tx ty tz, camera to world in metres. Newer
-versions add ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each picture, as the lens focuses and is stabilised) and
+``K`` of Record3D has 9 numbers, column by column, and a pose is qx qy qz qw tx ty tz, camera to world. Newer versions
+add ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each picture, as the lens focuses and is stabilised) and
 ``frameTimestamps`` (seconds), which come first. The depth of this export is OpenEXR, which is not read: frames come
 without depth.
 """

@@ -1,28 +1,19 @@
 """Data sets of rooms: ScanNet and Replica.
 
-ScanNet scenes as its tools export them.
+ScanNet scenes as its tools export them: poses are -inf where tracking was lost. Colour is larger than depth (1296x968
+against 640x480) and both cameras are taken to stand in one point, as the data set's extrinsics say. So each depth
+pixel's ray hits the colour image at ``K_color @ inv(K_depth) @ pixel``, whatever its depth: colour and labels are
+resampled to the depth image's pixels (colour by area, labels by nearest pixel), and the depth camera's intrinsics hold.
+Depth itself is not touched.
 
-``color/N.jpg``, ``depth/N.png`` (uint16 mm), ``pose/N.txt`` (4x4 camera to world, -inf where tracking was lost),
-``intrinsic/intrinsic_color.txt`` and ``intrinsic_depth.txt`` (or ``intrinsics_color.txt`` in the folder itself), and
-``label-filt/N.png`` or ``label/N.png``: 8 bits hold NYU40 ids; 16 bits hold ScanNet's raw ids, which need the data
-set's ``scannetv2-labels.combined.tsv`` in this folder or up to two above.
+Replica rooms as rendered for Semantic-NeRF: one sequence of one scene, ``SCENE/Sequence_1`` (or 2). The layout and the
+units are those that ``SSR/datasets/replica/replica_datasets.py`` of https://github.com/Harry-Zhi/semantic_nerf reads;
+the camera is the one of its ``SSR/training/trainer.py``: 640x480, horizontal field of view 90 degrees, so fx = fy =
+320, and the principal point in the middle. Another image size keeps that field of view. Class names come from Replica's
+own ``info_semantic.json``, which is looked for in the sequence's folder, the scene's, its ``habitat``, and in
+``semantic_info/SCENE`` next to the scenes.
 
-Colour is larger than depth (1296x968 against 640x480) and both cameras are taken to stand in one point, as the data
-set's extrinsics say. So each depth pixel's ray hits the colour image at ``K_color @ inv(K_depth) @ pixel``, whatever
-its depth: colour and labels are resampled to the depth image's pixels (colour by area, labels by nearest pixel), and
-the depth camera's intrinsics hold. Depth itself is not touched.
-
-Replica rooms as rendered for Semantic-NeRF: one sequence of one scene.
-
-The folder is ``SCENE/Sequence_1`` (or 2): ``rgb/rgb_N.png``, ``depth/depth_N.png`` (uint16 mm, z),
-``semantic_class/semantic_class_N.png`` (uint8 class ids of Replica, 0 = none), ``semantic_instance/`` (not used), and
-``traj_w_c.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``, OpenCV axes). The layout and the units are
-those that ``SSR/datasets/replica/replica_datasets.py`` of https://github.com/Harry-Zhi/semantic_nerf reads; the camera
-is the one of its ``SSR/training/trainer.py``: 640x480, horizontal field of view 90 degrees, so fx = fy = 320, and the
-principal point in the middle. Another image size keeps that field of view.
-
-Class names come from Replica's own ``info_semantic.json`` ("classes": [{"id", "name"}, ...]), which is looked for in
-the sequence's folder, the scene's, its ``habitat``, and in ``semantic_info/SCENE`` next to the scenes.
+Replica rooms as rendered for NICE-SLAM: ``traj.txt`` has OpenCV's axes, and one ``cam_params.json`` is for all rooms.
 """
 
 from __future__ import annotations
@@ -30,6 +21,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -161,7 +153,7 @@ def _scannet_intrinsics(folder: Path, which: str, images: Iterable[Path]) -> Cam
 REPLICA_SCALE = DepthScale(1000.0, convention="millimetres, as Semantic-NeRF's renderer writes them")
 REPLICA_HZ = 30.0  # the renderer has no clock; its path moves like a hand-held camera at this rate
 REPLICA_HFOV_DEG = 90.0
-_INFO = "info_semantic.json"
+_INFO, _PARAMS = "info_semantic.json", "cam_params.json"
 
 
 class _Class(msgspec.Struct):
@@ -199,6 +191,33 @@ def open_replica(folder: Path, options: ImportOptions) -> PosedPictures:
     label_set = _replica_labels(here, notices) if labels else None
     source = f"replica {here.parent.name} {here.name}"
     return PosedPictures(source, pictures, options, REPLICA_SCALE, notices, hz=REPLICA_HZ, labels=label_set)
+
+
+class _Camera(msgspec.Struct):
+    w: float
+    h: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    scale: Annotated[float, msgspec.Meta(gt=0)]  # units of depth per metre
+
+
+def open_nice_slam(folder: Path, options: ImportOptions) -> PosedPictures:
+    """A room, opened; one frame for each image. Raises ImportSourceError: images, poses or camera are missing."""
+    notices: list[str] = []
+    here = folder.resolve()
+    file = next((f for f in (here / _PARAMS, here.parent / _PARAMS) if f.exists()), here.parent / _PARAMS)
+    k = convert_known(read_plain_json(file).get("camera"), _Camera, file)
+    intrinsics = camera_of(file, (k.fx, k.fy, k.cx, k.cy), (k.w, k.h))
+    color = numbered_files(folder / "results", (".jpg",), notices)
+    depth = numbered_files(folder / "results", (".png",), notices)
+    poses = read_pose_rows(folder / "traj.txt", color.keys())
+    pictures = [
+        PosedPicture(image, intrinsics, poses[number], round(number * 1e9 / REPLICA_HZ), depth.get(number), seq=number)
+        for number, image in color.items()
+    ]
+    return PosedPictures(f"replica {here.name}", pictures, options, DepthScale(k.scale, file), notices, hz=REPLICA_HZ)
 
 
 def _replica_labels(here: Path, notices: list[str]) -> LabelSet | None:

@@ -14,23 +14,25 @@ from semantic_mapper.replay.importers.kitti360 import open_kitti360
 from semantic_mapper.replay.importers.models import find_opensfm, open_colmap, open_opensfm
 from semantic_mapper.replay.importers.phones import open_polycam, open_record3d
 from semantic_mapper.replay.importers.posed import PosedPictures
-from semantic_mapper.replay.importers.rooms import open_replica, open_scannet
+from semantic_mapper.replay.importers.rooms import open_nice_slam, open_replica, open_scannet
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.rosbag import open_rosbag
-from semantic_mapper.replay.importers.seven_scenes import MARKS, open_seven_scenes
+from semantic_mapper.replay.importers.seven_scenes import open_seven_scenes
 from semantic_mapper.replay.importers.transforms import open_transforms
-from semantic_mapper.replay.importers.tum import open_tum
+from semantic_mapper.replay.importers.tum import open_icl, open_tum
 from semantic_mapper.replay.log.format import LogReader, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap import find_models
 from semantic_mapper.transport.images import CodecOptions
 
-FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
+FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {  # layouts.toml shows the files of each
     "folder": open_folder,
     "tum": open_tum,
+    "icl": open_icl,
     "scannet": open_scannet,
     "replica": open_replica,
+    "nice-slam": open_nice_slam,
     "7-scenes": open_seven_scenes,
     "kitti360": open_kitti360,
     "rosbag": open_rosbag,
@@ -42,12 +44,14 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {
 }
 
 # What a folder of each format has, and no other. The other formats are known by what is in their files.
-_MARKS = {
+MARKS = {
     "folder": ("color", "poses.txt", "intrinsics.json"),
+    "icl": ("associations.txt", "*.gt.freiburg"),  # before TUM, whose lists programs write next to them
     "tum": ("rgb.txt", "groundtruth.txt"),
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
-    "7-scenes": MARKS,
+    "nice-slam": ("results", "traj.txt"),
+    "7-scenes": ("frame-*.color.png", "frame-*.pose.txt"),
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
     "polycam": ("keyframes",),
     "record3d": ("rgb", "metadata.json"),
@@ -55,6 +59,7 @@ _MARKS = {
 }
 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
+_SHOWN = "; docs/layouts.md shows the files of each format"
 LISTED = 5  # recordings that an error names
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
@@ -70,12 +75,9 @@ _FILES = {
 _FOLDERS = {
     "transforms_train.json": "has its frames in transforms_train.json, _val and _test; put those that are wanted into "
     "one transforms.json",
-    "associations.txt": "has associations.txt, as ICL-NUIM: write its columns as rgb.txt and depth.txt ('stamp file'), "
-    "the poses as groundtruth.txt, and intrinsics.json; where fy is negative, flip y in the poses",
+    "associations.txt": "has associations.txt, but neither ICL-NUIM's *.gt.freiburg nor TUM's rgb.txt",
     "rgbd": "is Record3D's own format, unpacked; export it on the phone as 'EXR + RGB'",
-    "traj.txt": "is a room of Replica as NICE-SLAM renders it, and only Semantic-NeRF's (with traj_w_c.txt) is read. "
-    "Rewrite it as a sequence folder: color/NNNNNN.jpg, depth/NNNNNN.png, poses.txt (the rows of traj.txt), "
-    "intrinsics.json (of cam_params.json, depth_scale is its scale)",
+    "traj.txt": "has traj.txt, as rooms of Replica that NICE-SLAM renders, but no results/",
     "database.db": "has COLMAP's database, but no model; run the mapper, and name the folder that holds sparse/",
 }
 
@@ -118,12 +120,12 @@ def is_recording(src: Path) -> bool:
 
 
 def _by_marks(src: Path) -> str | None:
-    return next((name for name in _MARKS if not _lacks(src, name)), None)
+    return next((name for name in MARKS if not _lacks(src, name)), None)
 
 
 def _lacks(src: Path, name: str) -> list[str]:
     """Files and folders of a format that a folder does not have."""
-    return [mark for mark in _MARKS[name] if next(src.glob(mark), None) is None]
+    return [mark for mark in MARKS[name] if next(src.glob(mark), None) is None]
 
 
 def _what_folder(src: Path) -> str:
@@ -134,10 +136,10 @@ def _what_folder(src: Path) -> str:
     below = [p for p in sorted(src.iterdir()) if is_bag(p) or (p.is_dir() and _by_marks(p) is not None)]
     if below:
         return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
-    name = min(_MARKS, key=lambda n: len(_lacks(src, n)))
-    if len(_lacks(src, name)) < len(_MARKS[name]):
-        return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}"
-    return f"is no recording of a known format ({', '.join(FORMATS)}); replay/importers/ says what each consists of"
+    name = min(MARKS, key=lambda n: len(_lacks(src, n)))
+    if len(_lacks(src, name)) < len(MARKS[name]):
+        return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}{_SHOWN}"
+    return f"is no recording of a known format ({', '.join(FORMATS)}){_SHOWN}"
 
 
 def _what_file(src: Path) -> str:

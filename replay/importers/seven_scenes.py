@@ -1,7 +1,6 @@
-"""7-Scenes as published: a sequence of a Kinect.
+"""7-Scenes as published: a sequence of a Kinect, such as ``chess/seq-01``.
 
-``frame-NNNNNN.color.png``, ``frame-NNNNNN.depth.png`` (uint16 mm, 65535 = no measurement) and ``frame-NNNNNN.pose.txt``
-(4x4, depth camera to world) lie in one folder, such as ``chess/seq-01``. The data set gives a focal length of 585 and a
+Poses are those of the depth camera; depth of 65535 is no measurement. The data set gives a focal length of 585 and a
 principal point of (320, 240) for depth, and nothing for colour. Those of the colour camera, and where it sits, are
 estimated: edges of depth were brought onto edges of colour in one of its sequences. Depth is registered to colour, and
 poses become those of the colour camera.
@@ -27,7 +26,6 @@ from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import numbered_files, read_matrix, without_picture
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
-MARKS = ("frame-*.color.png", "frame-*.pose.txt")
 _CALIBRATIONS = ("info.txt", "camera-intrinsics.txt")  # of other data sets in this layout
 SCALE = DepthScale(1000.0, convention="7-Scenes' millimetres")
 HZ = 30.0

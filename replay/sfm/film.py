@@ -145,7 +145,7 @@ def pictures_of(folder: Path) -> list[Path]:
         if other is not None:
             raise ImportSourceError(
                 f"{files[0].parent}: holds two pictures of each number ({kind}, {other}), so it is no film, and no "
-                "recording of a known format; write colour and depth as a sequence folder (docs/recordings.md), or "
+                "recording of a known format; write colour and depth as a sequence folder (docs/layouts.md), or "
                 "give the pictures of the film a folder of their own"
             )
     return files

@@ -58,9 +58,9 @@ def pose_row(number: int) -> str:
     return " ".join(repr(float(x)) for x in pose(number).ravel())
 
 
-def make_folder(folder: Path, count: int = 6, suffix: str = "jpg") -> Path:
+def make_folder(folder: Path, count: int = 6) -> Path:
     for i in range(count):
-        write_image(folder / "color" / f"{i:06d}.{suffix}", color(i))
+        write_image(folder / "color" / f"{i:06d}.jpg", color(i))
         write_image(folder / "depth" / f"{i:06d}.png", depth(i))
         write_image(folder / "label" / f"{i:06d}.png", label(i))
     (folder / "poses.txt").write_text("\n".join(pose_row(i) for i in range(count)) + "\n")

@@ -1,4 +1,4 @@
-"""``import`` of logs, ``info`` of logs, maps and boxes."""
+"""``info`` of maps and boxes."""
 
 from __future__ import annotations
 
@@ -12,21 +12,8 @@ import pytest
 from semantic_mapper.labels import ROOMS
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_voxel_map import fuse_sphere
-from tests.nodes.support import refused, run, run_ok
+from tests.nodes.support import refused, run_ok
 from tests.small import tiny_frames
-
-
-def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(log: Path, tmp_path: Path) -> None:
-    source, new = tmp_path / "sequence", tmp_path / "sequence.mcap"
-    run_ok("export", log, "--out", source, "--format", "folder", "--max-frames", "4")
-    poses = (source / "poses.txt").read_text().splitlines()
-    poses[2] = " ".join(["nan"] * 16)
-    (source / "poses.txt").write_text("\n".join(poses))
-    said = run_ok("import", source, new).stdout
-    assert "3 frames (3 of them labelled)" in said and "frame 2" in said and "poses.txt" in said
-    found = json.loads(run("info", new, "--json").stdout)
-    assert found["frames"] == found["frames_with_depth"] == found["frames_with_labels"] == 3
-    assert [c["width"] for c in found["cameras"].values()] == [96] and found["damage"] == []
 
 
 def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:

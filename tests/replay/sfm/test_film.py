@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.sfm.film import Film, FilmLook, look_through, pick_frames
 from semantic_mapper.types import UInt8
 
@@ -56,16 +55,6 @@ def test_a_damaged_film_is_read_past_its_damage_and_counts_what_is_lost(tmp_path
     frames = list(film)
     assert 6 <= len(frames) < 12 and film.unread == 12 - len(frames)
     assert frames[-1].stamp_ns == stamps[-1] and {frame.stamp_ns for frame in frames} <= set(stamps)
-
-
-def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImportSourceError, match="no such film"):
-        Film(tmp_path / "none.mp4")
-    with pytest.raises(ImportSourceError, match="no pictures"):
-        Film(tmp_path)
-    (tmp_path / "a.mp4").write_bytes(b"not a film")
-    with pytest.raises(ImportSourceError, match="no film that OpenCV can decode"):
-        Film(tmp_path / "a.mp4")
 
 
 def test_the_look_measures_motion_and_finds_blurred_and_dark_frames(tmp_path: Path) -> None:
