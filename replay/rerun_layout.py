@@ -1,7 +1,4 @@
-"""The page that Rerun shows: its layout, from where the map is looked at first, colour scales and legend.
-
-The SDK is an extra: import it from here. Raises DependencyError: on import, where it is not installed.
-"""
+"""The page that Rerun shows: its layout, from where the map is looked at first, colour scales and legend."""
 
 from __future__ import annotations
 
@@ -10,8 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
-from semantic_mapper.errors import DependencyError
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plots import (
@@ -29,14 +27,6 @@ from semantic_mapper.types import Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-try:
-    import rerun as rr
-    import rerun.blueprint as rrb
-except ModuleNotFoundError as error:
-    raise DependencyError(
-        "the viewer and Rerun files need the package rerun-sdk: pip install 'semantic-mapper[viewer]'"
-    ) from error
 
 MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
 AGED_S = 60.0  # what has not changed for so long has the last colour of the scale

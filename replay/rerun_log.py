@@ -1,7 +1,7 @@
 """What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in five colourings, stage times.
 
 The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike; ``rerun_layout`` says
-how. Raises DependencyError: on import, where the extra is not installed.
+how.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import LogError
@@ -35,7 +36,6 @@ from semantic_mapper.replay.rerun_layout import (
     draw_map_legend,
     eye_on,
     layout,
-    rr,
     scale_colors,
 )
 from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame

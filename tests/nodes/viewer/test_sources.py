@@ -101,7 +101,7 @@ def test_a_viewer_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pyte
     locked = 'if sys.argv[1] != "analytics": sys.exit("the door is locked")'
     program.write_text(f"#!{sys.executable} -I\nimport sys\n{locked}\n")
     program.chmod(0o755)
-    monkeypatch.setattr(server, "_find_program", lambda: str(program))
+    monkeypatch.setattr(server, "PROGRAM", program)
     with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0, 0):
         pass
 
