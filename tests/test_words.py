@@ -19,6 +19,7 @@ DIALECT = re.compile(
 )
 THIRD_PARTY = {  # words of others, by file
     "replay/importers/models.py": {"Shot", "shot", "shots"},  # keys of OpenSfM's files
+    "docs/layouts.md": {"shots"},
     "replay/sfm/colmap.py": {"ARM"},  # processors
 }
 

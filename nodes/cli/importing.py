@@ -36,7 +36,7 @@ _STAGES = {
 
 
 class SourceOptions(Options, frozen=True):
-    """Options of films, and of recordings whose unit of length is not known."""
+    """Options of what is imported by `import` and by `map`."""
 
     rotate: Literal["0", "90", "180", "270"] = "0"  # turn images clockwise, degrees
     calibration: Path | None = None  # film: the camera's file, of `calibrate`
@@ -45,6 +45,10 @@ class SourceOptions(Options, frozen=True):
     distance: str = ""  # film: "SECONDS:U,V SECONDS:U,V METRES"
     square_mm: AtLeastZero = 0.0  # film: side of a board's square in it
     camera_height: AtLeastZero = 0.0  # film: over the floor, metres
+    # bags: ROLE=NAME of image, depth, info, depth_info or pose; repeated. depth=none (any format): without depth
+    topic: list[str] | None = None
+    world: str = ""  # bags: frame of tf that poses are in
+    body: str = ""  # bags: frame that poses are of
 
     @property
     def quarters(self) -> int:
@@ -58,6 +62,8 @@ class SourceOptions(Options, frozen=True):
 
     def film_options(self) -> FilmOptions:
         """As the import of films takes them. Raises ConfigError: values that cannot be, or that exclude each other."""
+        if self.topic or self.world or self.body:
+            raise ConfigError("a film has no topics and no frames; --topic, --world and --body are for recordings")
         if sum(map(bool, (self.scale, self.distance, self.square_mm, self.camera_height))) > 1:
             raise ConfigError("the scale comes from one source only: leave out all but one of the options that say it")
         hint = ScaleHint(
@@ -68,15 +74,15 @@ class SourceOptions(Options, frozen=True):
         )
         return FilmOptions(self.calibration, self.focal_prior or None, hint, self.quarters)
 
-    def recording_scale(self) -> float | None:
-        """Metres per unit, of a recording that has poses. Raises typer.BadParameter: options were given that are for
-        films alone."""
-        if msgspec.structs.replace(self, scale=0.0, rotate="0").given:
+    def reading(self, options: ImportOptions) -> ImportOptions:
+        """``options`` with what these say of a recording. Raises typer.BadParameter: some are for films alone."""
+        if msgspec.structs.replace(self, scale=0.0, rotate="0", topic=None, world="", body="").given:
             raise typer.BadParameter(
                 "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, "
                 "--square-mm and --camera-height are for films"
             )
-        return self.scale or None
+        topics, scale = _topics_by_role(self.topic or []), self.scale or None
+        return replace(options, quarters=self.quarters, scale=scale, topics=topics, world=self.world, body=self.body)
 
 
 @verb
@@ -94,10 +100,6 @@ def import_(
     every: AtLeastOne = 1,  # only every N-th frame
     megapixels: AtLeastZero = MEGAPIXELS,  # larger pictures of a recording are made smaller; 0 = never
     rename: Path | None = None,  # TOML: [classes] couch = "sofa", ...
-    # bags: of image, depth, info, depth_info or pose; repeated. depth=none (any format): without depth
-    topic: Annotated[list[str] | None, typer.Option(metavar="ROLE=NAME")] = None,
-    world: str = "",  # bags: frame of tf that poses are in
-    body: str = "",  # bags: frame that poses are of
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a log of a recording of another program, of a film, or of a damaged log.
@@ -122,10 +124,7 @@ def import_(
         and (rename is not None or max_frames or every > 1 or megapixels != MEGAPIXELS)
     ):
         raise typer.BadParameter("a film has no classes to rename, and all of it is read, in a size of its own")
-    topics = _topics_by_role(topic or [])
-    reading = ImportOptions(
-        every, max_frames or None, megapixels=megapixels, topics=topics, renames=renames, world=world, body=body
-    )
+    reading = ImportOptions(every, max_frames or None, megapixels=megapixels, renames=renames)
     import_source(output, source, log, options, format_, reading, overwrite=overwrite)
 
 
@@ -151,7 +150,7 @@ def import_source(
     if format_name is None and is_film(source):
         _import_film(output, source, log, options.film_options(), overwrite=overwrite)
         return 0
-    reading = replace(reading or ImportOptions(), quarters=options.quarters, scale=options.recording_scale())
+    reading = options.reading(reading or ImportOptions())
     with frame_progress("import", None) as bar:
 
         def on_progress(done: int, total: int) -> None:

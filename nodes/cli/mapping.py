@@ -22,12 +22,13 @@ from semantic_mapper.nodes.cli.verb import (
 )
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.importers.run import needs_import
 from semantic_mapper.replay.log import demo_log
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, is_log, prepare_folder
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, prepare_folder
 from semantic_mapper.replay.summary import dig, headlines, notes, result_lines
 
 
-class FilmSourceOptions(SourceOptions, frozen=True):
+class HiddenSourceOptions(SourceOptions, frozen=True):
     """The same; the help of `import` says what they are."""
 
     hidden: ClassVar = True
@@ -39,7 +40,7 @@ def map_(
     # Recorded log (.mcap), its parts, or a folder with them; or a film, pictures or recording that `import` takes
     source: list[Path],
     mapper: MapperSettings,
-    options: FilmSourceOptions,
+    options: HiddenSourceOptions,
     *,
     out: Path | None = None,  # folder for the results; made if missing [runs/NAME]
     weights: WeightsOption = None,
@@ -53,7 +54,7 @@ def map_(
     """Map a recording: a log, a film, or a folder or bag that `import` takes.
 
     Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, to a log in
-    OUT, with the options of `import` (--rotate, --calibration, --scale, ...).
+    OUT, with the options of `import` (--topic, --rotate, --calibration, --scale, ...).
 
     Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
@@ -69,7 +70,7 @@ def map_(
 
     config = mapper.load(OFFLINE)
     out = out or Path("runs") / source[0].resolve().stem
-    if not is_log(source[0]):
+    if needs_import(source[0]):
         if len(source) > 1:
             raise typer.BadParameter("of several sources each has to be a part of one log", param_hint="SOURCE")
         if weights is not None:
@@ -79,7 +80,9 @@ def map_(
             with_depth = import_source(output, source[0], log, options, overwrite=True)
         source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
     elif options.given:
-        raise typer.BadParameter("a log is mapped as it is; options of films go with films", param_hint="SOURCE")
+        raise typer.BadParameter(
+            "a log is mapped as it is; options of `import` go with what is imported", param_hint="SOURCE"
+        )
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:
             summary, _ = replay_log(

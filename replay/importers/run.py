@@ -22,7 +22,7 @@ from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import open_icl, open_tum
 from semantic_mapper.replay.log.format import LogReader, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
-from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, is_log
 from semantic_mapper.replay.sfm.colmap import find_models
 from semantic_mapper.transport.images import CodecOptions
 
@@ -78,6 +78,7 @@ _FOLDERS = {
     "associations.txt": "has associations.txt, but neither ICL-NUIM's *.gt.freiburg nor TUM's rgb.txt",
     "rgbd": "is Record3D's own format, unpacked; export it on the phone as 'EXR + RGB'",
     "traj.txt": "has traj.txt, as rooms of Replica that NICE-SLAM renders, but no results/",
+    "map.npz": "holds the results of a run; name its log, or the recording that it was made of",
     "database.db": "has COLMAP's database, but no model; run the mapper, and name the folder that holds sparse/",
 }
 
@@ -107,6 +108,12 @@ def detect_format(src: Path) -> str:
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
+
+
+def needs_import(src: Path) -> bool:
+    """Whether a source is no log, though it may end as logs do: bags of ROS 2 are MCAP files, too, and the log of a
+    recording may lie in the recording's folder."""
+    return not is_log(src) or is_bag(src) or (src.is_dir() and _by_marks(src) is not None)
 
 
 def is_recording(src: Path) -> bool:

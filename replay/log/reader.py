@@ -226,9 +226,9 @@ class LogReader:
         if not infos:
             why = f" ({self.errors[0]})" if self.errors else ""
             raise LogError(
-                f"{self.path}: says nothing of its cameras and classes{why}: not a log of semantic-mapper (what "
-                "`export` writes for Foxglove is not one either: use the log it was made of), damaged, or cut off "
-                "before its first frame"
+                f"{self.path}: says nothing of its cameras and classes{why}: not a log of semantic-mapper (`import` "
+                "makes one of a ROS bag; of what `export` writes for Foxglove use the log it was made of), damaged, or "
+                "cut off before its first frame"
             )
         cameras, sources = dict(infos[0].cameras), [infos[0].source]
         for info in infos:

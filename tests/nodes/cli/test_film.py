@@ -56,6 +56,7 @@ def test_what_is_no_film_is_refused_but_not_before_missing_weights_are(tmp_path:
     assert done.returncode == 1 and "no film that OpenCV can decode" in done.stderr
     assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1  # FFmpeg's own lines are not shown
     assert not (out / "a.mcap").exists()
+    assert "no topics" in refused("map", film, "--out", out, "--topic", "image=/camera")
     assert "nope.safetensors" in refused("map", film, "--out", out, "--weights", tmp_path / "nope.safetensors")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from semantic_mapper.geometry import project, unproject
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.importers.base import ImportOptions, ImportReport
 from semantic_mapper.replay.importers.kitti360 import LABELS, depth_of_scan
-from semantic_mapper.replay.importers.run import detect_format, import_recording
+from semantic_mapper.replay.importers.run import detect_format, import_recording, needs_import
 from semantic_mapper.replay.importers.seven_scenes import T_COLOR_DEPTH
 from semantic_mapper.types import CameraIntrinsics
 from tests.replay import recordings as rec
@@ -135,6 +136,7 @@ def test_an_import_without_one_good_frame_fails_and_leaves_an_older_log_alone(fo
     dst = folder.parent / "log.mcap"
     import_recording(folder, dst)
     before = dst.read_bytes()
+    assert not needs_import(dst) and needs_import(shutil.copy(dst, folder / "log.mcap").parent)
     (folder / "poses.txt").write_text("\n".join(["nan " * 16] * 6))
     with pytest.raises(ImportSourceError, match="none of its 6 frames can be used"):
         import_recording(folder, dst, overwrite=True)

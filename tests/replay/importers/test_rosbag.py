@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.importers.ros_transforms import Track
-from semantic_mapper.replay.importers.run import detect_format
+from semantic_mapper.replay.importers.run import detect_format, needs_import
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.replay import bags
@@ -451,7 +451,7 @@ def test_bags_are_known_by_their_content(
 ) -> None:
     file = next(f for f in make(tmp_path, kind).iterdir() if f.suffix != ".yaml")
     (tmp_path / name).write_bytes(changed(file.read_bytes()))
-    assert detect_format(tmp_path / name) == "rosbag"
+    assert detect_format(tmp_path / name) == "rosbag" and needs_import(tmp_path / name)
     report, frames = imported(tmp_path / name)
     assert report.frames == 6 and np.array_equal(frames[3].rgb, FRAMES[3].rgb)
 
