@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
+import webbrowser
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -46,3 +48,9 @@ class LocalServer(ThreadingHTTPServer):
         error = sys.exc_info()[1]
         report = _log.debug if isinstance(error, OSError) else _log.warning
         report("request_not_served", reason=f"{type(error).__name__}: {error}")
+
+
+def open_browser(url: str) -> None:
+    """Show a page in a browser of this desktop; without a desktop, as behind ssh, nothing happens."""
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)  # else it would start a text browser in this terminal

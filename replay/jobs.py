@@ -5,11 +5,11 @@ The command line, the nodes and the fleet call these; ``finetune_log`` and ``aut
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -36,6 +36,10 @@ from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.scale import fit_to_scene
 from semantic_mapper.types import PosedFrame
 
+if TYPE_CHECKING:
+    from semantic_mapper.mapping.pipeline import MappingPipeline
+    from semantic_mapper.replay.rerun_log import RerunLog
+
 # Of the mapper, where its settings say nothing: nobody waits for the map of a log, so that a frame whose depth is
 # computed waits for later ones.
 OFFLINE = {"depth.from_motion.delay_frames": 6}
@@ -51,6 +55,7 @@ def replay_log(
     max_frames: int = 0,
     *,
     rerun: Path | None = None,
+    watch: Callable[[MappingPipeline], RerunLog] | None = None,
     corrections: Path | None = None,
     monitor: JobMonitor | None = None,
 ) -> tuple[dict[str, Any], MapSession]:
@@ -62,8 +67,9 @@ def replay_log(
     corrections cannot be read.
 
     ``log`` may be a folder with the parts of a recording, or these parts; ``max_frames`` 0 means all. A Rerun recording
-    goes to ``rerun``. ``corrections`` is a trajectory file that the map is moved to at the end of the log. ``monitor``
-    gets the progress, and may end it early; ``stopped_by`` of the summary names the signal.
+    goes to ``rerun``, or to what ``watch`` makes of the pipeline. ``corrections`` is a trajectory file that the map is
+    moved to at the end of the log. ``monitor`` gets the progress, and may end it early; ``stopped_by`` of the summary
+    names the signal.
     """
     monitor = monitor or JobMonitor()
     trajectory = read_corrections(corrections) if corrections else None
@@ -81,7 +87,7 @@ def replay_log(
             stream_labels=source.info.label_set,
             source=source.info.source,
             scale_known=source.info.scale_known,
-            rerun=open_recording(rerun, mapper.pipeline),
+            rerun=open_recording(rerun, mapper.pipeline) if watch is None else watch(mapper.pipeline),
         )
         session.left_out = read_left_out(source.attachments())
         for error in source.errors:  # stretches of the file in which no frame can be made out

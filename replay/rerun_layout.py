@@ -32,36 +32,35 @@ MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orang
 AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
 CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
+CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
 DISTANCE = 0.8  # of the eye, times the map's diagonal
 _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
 class Eye(NamedTuple):
-    """From where the map is looked at first: position, target and up (3,), world metres."""
+    """From where the map is looked at first: position, target and up (3,), world metres; and how far along up its
+    ceiling begins, infinite where it has none."""
 
     position: Float64
     target: Float64
     up: Float64
+    ceiling: float
 
 
 def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
-    """An eye on a map, points (N, 3), N > 0, from its most open side: from above, or, of a room with a ceiling, from
-    inside, out of a corner. ``up`` (3,) is a first guess of which way is up; None = unknown."""
+    """An eye on a map, points (N, 3), N > 0, from above, on its most open side; what is above its ceiling is not to be
+    shown then. ``up`` (3,) is a first guess of which way is up; None = unknown."""
     R_upright_world = upright_rotation(xyz, up)
     upright = xyz.astype(np.float64) @ R_upright_world.T
-    low, high = np.percentile(upright, (1, 99), axis=0)
+    ceiling = ceiling_height(upright)
+    low, high = np.percentile(upright if ceiling is None else upright[upright[:, 2] < ceiling], (1, 99), axis=0)
     target, size = (low + high) / 2, np.maximum(high - low, 0.3)
     azimuth = open_side(upright)
-    towards = np.array((np.cos(azimuth), np.sin(azimuth)))
-    if ceiling_height(upright) is None:
-        direction = np.append(towards * np.cos(ELEVATION), np.sin(ELEVATION))
-        position = target + DISTANCE * float(np.linalg.norm(size)) * direction
-    else:
-        corner = towards / np.abs(towards / size[:2]).max()  # half of the way there is the side of the bounds
-        position = np.append(target[:2] + 0.4 * corner, low[2] + 0.8 * size[2])
-        target = np.append(target[:2] - 0.15 * corner, low[2] + 0.2 * size[2])
-    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2])
+    direction = np.array((np.cos(azimuth) * np.cos(ELEVATION), np.sin(azimuth) * np.cos(ELEVATION), np.sin(ELEVATION)))
+    position = target + DISTANCE * float(np.linalg.norm(size)) * direction
+    ceiling = np.inf if ceiling is None else ceiling
+    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2], ceiling)
 
 
 def scale_colors(level: Float32, scale: int) -> UInt8:
@@ -109,16 +108,17 @@ def layout(cameras: Sequence[str], colourings: Sequence[str], eye: Eye | None) -
     maps = [
         rrb.Spatial3DView(
             origin="/world",
-            contents=[*seen, f"+ /world/map/{name}", *(["+ /world/graph/**"] if name == "class" else [])],
-            name=f"map: {name}",
+            contents=[*seen, f"+ /world/map/{name}/**", *(["+ /world/graph/**"] if name == "class" else [])],
+            name=name,
             eye_controls=eyes,
+            overrides={f"/world/map/{name}/{CEILING}": rrb.EntityBehavior(visible=False)},
             line_grid=False,
         )
         for name in colourings
     ]
     space = rrb.Tabs(*maps, active_tab=0, name="map")
     legend = rrb.Spatial2DView(origin="/legend", name="legend")
-    above = rrb.Horizontal(space, legend, column_shares=[4, 1]) if eye is not None else space
+    above = rrb.Grid(space, legend, column_shares=[4, 1]) if eye is not None else space
     panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
     if not cameras:
         return rrb.Blueprint(above, rrb.TimePanel(state="hidden"), *panels)

@@ -7,6 +7,7 @@ how.
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
-from semantic_mapper.queries.graph import SceneGraph
+from semantic_mapper.queries.graph import HUNG_NAMES, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.base import CameraPath
 from semantic_mapper.replay.rerun_layout import (
     AGE_SCALE,
     AGED_S,
+    CEILING,
     COMPUTED_COLOR,
     CONFIDENCE_SCALE,
     MEASURED_COLOR,
@@ -38,7 +40,7 @@ from semantic_mapper.replay.rerun_layout import (
     layout,
     scale_colors,
 )
-from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame
 
 APPLICATION = "semantic_mapper"
 IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log stays small
@@ -47,7 +49,8 @@ FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
 REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
-ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
+NAMED, NAMED_M = 3, 0.4  # kinds of things that a room is called by; the least length of a thing with a name
+ROOM_COLOR, DOOR_RADIUS_M, DOT_RADIUS_M = (255, 255, 255), 0.06, 0.01
 GONE_COLOR = (150, 150, 150)
 
 
@@ -163,8 +166,13 @@ class RerunLog:
         if age_s is not None:
             looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
         self._look_at(points, list(looks))
+        above = np.zeros(len(points.xyz), np.bool_)
+        if self._eye is not None:
+            above = points.xyz @ self._eye.up >= self._eye.ceiling
         for name, look in looks.items():
-            self._stream.log(f"world/map/{name}", rr.Points3D(points.xyz, radii=self._radius, **look))
+            for part, kept in ("", ~above), (f"/{CEILING}", above):
+                shown = {kind: values[kept] for kind, values in look.items()}
+                self._stream.log(f"world/map/{name}{part}", rr.Points3D(points.xyz[kept], radii=self._radius, **shown))
         legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
         self._stream.log("legend", rr.Image(legend))
 
@@ -174,16 +182,26 @@ class RerunLog:
         Where things were that are ``gone`` is drawn in grey, with the stamp of when they went.
         """
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
-        names = [f"room {room.id}, {room.area_m2:.1f} m²" for room in graph.rooms]
-        self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR, labels=names, show_labels=True))
+        self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR))
+        names, middles = room_names(graph), np.array([room.center for room in graph.rooms]).reshape(-1, 3)
+        self._log_names("world/graph/room_names", middles, names, ROOM_COLOR)
         doors = np.array([door.center for door in graph.doors]).reshape(-1, 3)
         widths = [f"door, {door.width_m:.2f} m" for door in graph.doors]
         self._stream.log("world/graph/doors", rr.Points3D(doors, radii=DOOR_RADIUS_M, colors=ROOM_COLOR, labels=widths))
         classes = [thing.class_id for thing in graph.things]
-        labels = [f"{thing.class_name} {thing.id}" for thing in graph.things]
-        self._log_boxes("things", graph.things, class_ids=classes, labels=labels, show_labels=False)
+        self._log_boxes("things", graph.things, class_ids=classes, show_labels=False)
+        large = [thing for thing in graph.things if is_large(thing)]
+        tops = [t.box.center + graph.up * (np.abs(t.box.R_world_box.T @ graph.up) @ t.box.size / 2) for t in large]
+        tints = {i: (np.array(c) + 255) // 2 for i, c in zip(self._label_set.ids, self._label_set.colors, strict=True)}
+        names = [f"{thing.class_name} {thing.id}" for thing in large]
+        colors = [tints[thing.class_id] for thing in large]  # brown would not be read on black
+        self._log_names("world/graph/thing_names", np.array(tops).reshape(-1, 3), names, colors)
         left = [f"{thing.class_name} {thing.id}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
         self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
+
+    def _log_names(self, entity: str, xyz: Float64, names: Sequence[str], colors: Any) -> None:
+        shown = rr.Points3D(xyz, radii=DOT_RADIUS_M, colors=colors, labels=names, show_labels=True)
+        self._stream.log(entity, shown)
 
     def _log_boxes(self, name: str, things: Sequence[Instance], **look: Any) -> None:
         boxes = [thing.box for thing in things]
@@ -194,6 +212,7 @@ class RerunLog:
                 centers=np.array([box.center for box in boxes]).reshape(-1, 3),
                 sizes=np.array([box.size for box in boxes]).reshape(-1, 3),
                 quaternions=np.array(turns).reshape(-1, 4),
+                fill_mode="majorwireframe",
                 **look,
             ),
         )
@@ -246,6 +265,26 @@ class RerunLog:
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
         if seq is not None:
             self._stream.set_time("frame", sequence=seq)
+
+
+def is_large(thing: Instance) -> bool:
+    """Whether it has its name on it: names of what is small, or a splinter, would cover others."""
+    return float(thing.box.size.max()) >= NAMED_M
+
+
+def room_names(graph: SceneGraph) -> list[str]:
+    """What to call each room, by the largest that stands in it: "room 1: chairs, table"."""
+    names = list[str]()
+    for room in graph.rooms:
+        size, count = Counter[str](), Counter[str]()
+        for thing in graph.things:
+            telling = thing.class_name not in HUNG_NAMES and not thing.class_name.startswith("other")
+            if telling and is_large(thing) and graph.room_of[thing.id] == room.id:
+                size[thing.class_name] += len(thing.voxels)
+                count[thing.class_name] += 1
+        holds = [f"{name}s" if count[name] > 1 and name[-1] != "s" else name for name, _ in size.most_common(NAMED)]
+        names.append(f"room {room.id}" + (f": {', '.join(holds)}" if holds else ""))
+    return names
 
 
 def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:

@@ -69,11 +69,13 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
             if not wait_for_listeners(context, publisher, acks):
                 _log.info("played", published=0, stopped=True)
                 return
-            bar = stack.enter_context(frame_progress("played", frames_to_play(log, play_options)))
+            total = frames_to_play(log, play_options)
+            bar = stack.enter_context(frame_progress("played", total)) if total else None
             playback = Playback(context, options.rate)
 
             def on_frame(envelope: Envelope) -> None:
-                bar.advance()
+                if bar is not None:
+                    bar.advance()
                 playback.note_frame(envelope.stamp_ns)
 
             play_options = dataclasses.replace(play_options, from_stamp_ns=playback.due_stamp_ns())

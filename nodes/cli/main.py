@@ -15,7 +15,7 @@ from semantic_mapper.nodes.cli.verb import Settings
 _MODULES = "semantic_mapper.nodes.cli"
 # By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
 VERBS: Mapping[str, tuple[str, str]] = {
-    "demo": ("mapping:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
+    "demo": ("demo:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
     "map": ("mapping:map_", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
     "compare": ("compare:compare", "Compare two runs of one log: counts, scores, and how far the maps are apart."),
     "up": ("up:up", "Start the nodes of a launch file as processes and watch over them until they end."),

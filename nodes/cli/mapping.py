@@ -1,10 +1,9 @@
-"""The verbs ``map`` and ``demo``: a recording becomes a map, in this process."""
+"""``semantic-mapper map``: a recording becomes a map, in this process."""
 
 from __future__ import annotations
 
-import time
-import webbrowser
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,13 +17,15 @@ from semantic_mapper.nodes.cli.verb import (
     MaxFramesOption,
     WeightsOption,
     must_be_there,
+    refuse_options,
     verb,
 )
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.local_server import open_browser
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.viewer.server import ViewerPage
 from semantic_mapper.replay.importers.run import needs_import
-from semantic_mapper.replay.log import demo_log
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder, prepare_folder
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder
 from semantic_mapper.replay.summary import dig, headlines, notes, result_lines
 
 
@@ -50,6 +51,7 @@ def map_(
     corrections: Path | None = None,
     accept_contradictions: bool = False,  # exit code 0 in place of 3
     open_: bool = False,  # show the report in a browser at the end
+    view: bool = False,  # show frames and map in a browser meanwhile, and then until Ctrl-C
 ) -> int:
     """Map a recording: a log, a film, or a folder or bag that `import` takes.
 
@@ -65,6 +67,7 @@ def map_(
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     must_be_there(*source)
+    refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))
     from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
     from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
@@ -83,48 +86,23 @@ def map_(
         raise typer.BadParameter(
             "a log is mapped as it is; options of `import` go with what is imported", param_hint="SOURCE"
         )
-    with StopRequest() as stop:
+    with StopRequest() as stop, ViewerPage(output) if view else nullcontext() as page:
         with frame_progress("map", None, stop=stop) as bar:
-            summary, _ = replay_log(
-                source, out, weights, config, max_frames, rerun=rerun, corrections=corrections, monitor=bar
-            )
+            more = {"rerun": rerun, "watch": page and page.watch, "corrections": corrections, "monitor": bar}
+            summary, _ = replay_log(source, out, weights, config, max_frames, **more)
         show_result(output, summary, out)
         output.json(summary)
         if open_:
-            webbrowser.open((out / "report.html").resolve().as_uri())
+            open_browser((out / "report.html").resolve().as_uri())
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         untrusted = dig(summary, "pose_check.warning") and not accept_contradictions
         empty = not dig(summary, "map.surface_points")
-        return stop.exit_code or (EXIT_UNTRUSTED if untrusted or empty else 0)
-
-
-@verb
-def demo(
-    output: Output,
-    mapper: MapperSettings,
-    *,
-    out: Path = Path("runs/demo"),  # folder for the results; made if missing
-    weights: WeightsOption = None,
-) -> int:
-    """Map a recorded log that comes with the package: a depth camera in a furnished room.
-
-    Ends with a map, a picture and a summary in OUT. Needs no camera, no data and no network.
-
-    Example: semantic-mapper demo --out runs/demo
-    """
-    from semantic_mapper.replay.jobs import replay_log
-
-    began = time.monotonic()
-    prepare_folder(out)
-    with StopRequest() as stop:
-        with frame_progress("map", None, stop=stop) as bar:
-            summary, _ = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar)
-        show_result(output, summary, out)
-        output.print(f"  {demo_log()}  (the log it was made from)")
-        ended = "stopped after" if stop else "done in"
-        stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
-        return stop.exit_code
+        code = stop.exit_code or (EXIT_UNTRUSTED if untrusted or empty else 0)
+        if page is not None and not stop:
+            stderr_console().print("the page stays until Ctrl-C")
+            page.wait(stop)
+        return code
 
 
 def show_result(output: Output, summary: Mapping[str, Any], out: Path) -> None:

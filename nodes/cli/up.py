@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
+from semantic_mapper.nodes.launcher.launch_file import Launch, find_launch, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
 from semantic_mapper.nodes.options import CameraOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -36,14 +37,18 @@ def up(
     Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
     Example: semantic-mapper up camera --set camera.kind=oak
     """
-    checked = load_launch(find_launch(launch), set_ or (), out)
-    must_be_there(*(Path(o.log) for o in checked.options.values() if isinstance(o, CameraOptions) and o.log))
-    folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
+    run_launch(output, load_launch(find_launch(launch), set_ or (), out))
+
+
+def run_launch(output: Output, launch: Launch, on_ready: Callable[[Path], None] = lambda folder: None) -> None:
+    """Run a launch until it ends or somebody asks to stop, and show its results; ``on_ready`` as of ``Launcher``."""
+    must_be_there(*(Path(o.log) for o in launch.options.values() if isinstance(o, CameraOptions) and o.log))
+    folders = [Path(o.out) for o in launch.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
     with StopRequest() as stop, ExitStack() as stack:
         for folder in dict.fromkeys(f.resolve() for f in folders):
             stack.enter_context(hold_folder(folder))
-        stack.enter_context(Launcher(checked, Notifier.from_environment())).run(stop)
+        stack.enter_context(Launcher(launch, Notifier.from_environment(), on_ready)).run(stop)
     fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
     results = print_results(output, fresh)
     for name, summary in results.items():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import rich.live
@@ -15,17 +17,13 @@ from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher import running
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.viewer.server import DATA_PORT, WEB_PORT, WebViewer
+from semantic_mapper.nodes.viewer.server import ViewerPage
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
 from semantic_mapper.transport.sockets import NewestSubscriber
 
 if TYPE_CHECKING:
-    from rerun import RecordingStream
-
     from semantic_mapper.nodes.viewer.sources import Live
 
-REFRESH_S = 2.0  # between two maps
-POLL_S = 0.2
 ANSWER_S = 5.0  # how long the launcher may take to say anything
 STATUS_REFRESH_S = 0.5
 FILE_WIDTH = 140  # columns of the table where nothing says how many there are
@@ -39,7 +37,7 @@ def view(
     # of a running launch, or where a mapper answers (tcp://...); by default the one launch that runs here
     source: str = "",
     *,
-    port: Port = WEB_PORT,  # of the web page; 0 = any that is free
+    port: Port | None = None,  # of the page; 0 = any that is free [9090, or any where that is taken]
     weights: WeightsOption = None,
     config: Path | None = None,  # log: TOML file with settings of the mapper
     status: bool = False,  # launch: show how its nodes are, as a table in this terminal
@@ -49,7 +47,8 @@ def view(
 
     Images, rendered semantics, depth, the camera's path, the map and stage times are shown.
     The map has a tab for each of its colourings: class, camera colour, confidence, and age, that is, how long ago its
-    surroundings last changed while they were watched (a saved map has none). A log is mapped while it is shown. The
+    surroundings last changed while they were watched (a saved map has none). A log is mapped as by `map --view`, and
+    nothing is kept. The
     page is served on this machine alone, and sends nothing anywhere; to see it from another one, tunnel both ports.
 
     With --status, twice a second: states, restarts, memory, rates, ages and losses of each node. frame: time since the
@@ -77,38 +76,22 @@ def view(
         other = "" if log or saved else ", and no socket folder of a launch"
         raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
     live = None if log or saved else _find_live(source, remote)
-    with StopRequest() as stop, _Page(port, output) as page:
+    with StopRequest() as stop, ViewerPage(output, port) as page, ExitStack() as stack:
         if saved is not None:
             from semantic_mapper.nodes.viewer.sources import show_saved
 
             show_saved(saved, page.begin)
         elif live is None:
-            _show_log(path, weights, config, page, stop)
+            from semantic_mapper.replay.jobs import replay_log
+
+            results = Path(stack.enter_context(TemporaryDirectory(prefix="semantic-mapper-view-")))
+            with frame_progress("map", None, stop=stop) as bar:
+                replay_log(path, results, weights, load_mapper_config(config), watch=page.watch, monitor=bar)
         else:
-            from semantic_mapper.nodes.viewer.sources import show_live
+            from semantic_mapper.nodes.viewer.sources import REFRESH_S, show_live
 
             show_live(live, page.begin, REFRESH_S, stop, output.print)
-        while not stop:
-            if not page.alive:
-                raise TransportError("the process that serves the viewer has ended; start `view` again")
-            time.sleep(POLL_S)
-
-
-class _Page(WebViewer):
-    """The page, whose address is shown when there is something on it."""
-
-    def __init__(self, port: int, output: Output) -> None:
-        super().__init__(port, DATA_PORT if port else 0)
-        self._output = output
-
-    def begin(self) -> RecordingStream:
-        """What writes on it."""
-        from semantic_mapper.replay.rerun_log import recording_server
-
-        self._output.address("watch at", self.page_url)
-        stream = recording_server(self.data_url)
-        self.callback(stream.disconnect)  # before its server ends, which it would complain of at length
-        return stream
+        page.wait(stop)
 
 
 def _find_live(source: str, remote: Remote) -> Live:
@@ -121,14 +104,6 @@ def _find_live(source: str, remote: Remote) -> Live:
     nodes = running.node_endpoints(folder)
     streams = sum(camera in nodes for camera in running.read_launch_note(folder).names("camera"))
     return Live(f"ipc://{folder}/{running.QUERY_SOCKET}", tuple(nodes.values()), streams=streams)
-
-
-def _show_log(path: Path, weights: Path | None, config: Path | None, page: _Page, stop: StopRequest) -> None:
-    from semantic_mapper.nodes.viewer.mapped_log import show_log
-
-    settings = load_mapper_config(config)
-    with frame_progress("map", None) as bar:
-        show_log(path, weights, settings, 0, page.begin, REFRESH_S, lambda: not stop and page.alive, bar)
 
 
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Self
 
 import psutil
@@ -94,12 +95,16 @@ class Launcher:
     """The processes of one launch; a context manager that leaves none behind.
 
     Sockets are in a folder of their own that only this user can enter; two launches never meet. ``notifier`` receives
-    the state of the launch, in addition to the status topic.
+    the state of the launch, in addition to the status topic; ``on_ready`` is called with the folder of its sockets once
+    all nodes are ready.
     """
 
-    def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
+    def __init__(
+        self, launch: Launch, notifier: Notifier | None = None, on_ready: Callable[[Path], None] = lambda folder: None
+    ) -> None:
         self._launch = launch
         self._notifier = notifier or Notifier("")
+        self._on_ready = on_ready
         self._processes: list[ManagedProcess] = []
         self._reported_ready = False
         self._stack = ExitStack()
@@ -107,6 +112,7 @@ class Launcher:
     def __enter__(self) -> Self:
         sweep()
         folder = OwnFolder()
+        self._folder = folder.path
         self._stack.callback(folder.close)  # last of all
         endpoints = {name: f"ipc://{folder.path}/{name}" for name in self._launch.sockets()}
         _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder.path))
@@ -161,6 +167,7 @@ class Launcher:
             self._reported_ready = True
             self._notifier.ready("all nodes are ready")
             _log.info("all_ready")
+            self._on_ready(self._folder)
         restarts = sum(p.restarts for p in self._processes)
         nodes = ", ".join(f"{name} {state}" for name, state in states.items())
         self._notifier.status(f"{nodes}; {restarts} restarts")

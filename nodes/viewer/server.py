@@ -19,16 +19,24 @@ from contextlib import ExitStack, closing, contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 from urllib.parse import quote
 
 import rerun_cli
 import structlog
 
 from semantic_mapper.errors import DependencyError, TransportError
+from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.liveness import end_with_launcher
-from semantic_mapper.nodes.local_server import HOST, LocalServer
+from semantic_mapper.nodes.local_server import HOST, LocalServer, open_browser
+from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+    from semantic_mapper.mapping.pipeline import MappingPipeline
+    from semantic_mapper.replay.rerun_log import RerunLog
 
 PROGRAM = Path(rerun_cli.__file__).with_name("rerun")  # comes with the SDK
 WEB_PORT, DATA_PORT = 9090, 9876
@@ -44,13 +52,54 @@ _log = structlog.get_logger(__name__)
 class WebViewer(ExitStack):
     """A web server with the viewer, and a data server that keeps what browsers are shown; a context manager.
 
-    A port 0 = any that is free; ``memory_mb`` is what the data server may keep for browsers that come later.
+    ``port`` is that of the page: 0 = any that is free; None = the usual one, or any where that is taken, which the data
+    server has unless ``port`` is 0. ``memory_mb`` is what it may keep for browsers that come later.
     """
 
-    def __init__(self, web_port: int = WEB_PORT, data_port: int = DATA_PORT, memory_mb: int = 512) -> None:
+    def __init__(self, port: int | None = None, memory_mb: int = 512) -> None:
         super().__init__()
-        self._requested = web_port, data_port
+        self._port = port
         self._memory_mb = memory_mb
+        self.data_url = ""  # where to send what is to be shown
+        self.page_url = ""  # what to open in a browser
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        """Start the servers and wait until they answer: ``DependencyError``, ``TransportError`` where they do not."""
+        try:
+            self._start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    @property
+    def pid(self) -> int:
+        """Of the servers' process."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still serves."""
+        return self._process is not None and self._process.poll() is None
+
+    def _start(self) -> None:
+        folder = self.enter_context(closing(OwnFolder("view-"))).path  # where we are killed, `up` removes it
+        settings = {f"XDG_{kind}_HOME": f"{folder}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
+        environment = {**os.environ, **settings}
+        result = subprocess.run([PROGRAM, "analytics", "disable"], env=environment, capture_output=True, check=False)
+        if result.returncode != 0:  # then it would call home
+            raise DependencyError(f"{PROGRAM}: analytics cannot be switched off: {result.stderr.decode().strip()}")
+        # Ports are held until all are chosen: one that was let go may be given out again.
+        data_port = 0 if self._port == 0 else None
+        with (
+            _hold_port(self._port, WEB_PORT) as port,
+            _hold_port(data_port, DATA_PORT) as data,
+            _hold_port(0, 0) as web,
+        ):
+            pass
+        page = self.enter_context(quiet_page(port, web, f"http://{HOST}:{data}"))
         self.data_url = ""  # where to send what is to be shown
         self.page_url = ""  # what to open in a browser
         self._process: subprocess.Popen[bytes] | None = None
@@ -84,8 +133,13 @@ class WebViewer(ExitStack):
             raise DependencyError(f"{PROGRAM}: analytics cannot be switched off: {result.stderr.decode().strip()}")
         # Ports are held until all are chosen: one that was let go may be given out again. The page answers before there
         # is anything to show, and so keeps its own.
-        with _hold_port(self._requested[1]) as data, _hold_port(0) as web:
-            page = self.enter_context(quiet_page(self._requested[0], web, f"http://{HOST}:{data}"))
+        data_port = 0 if self._port == 0 else None
+        with (
+            _hold_port(self._port, WEB_PORT) as port,
+            _hold_port(data_port, DATA_PORT) as data,
+            _hold_port(0, 0) as web,
+        ):
+            page = self.enter_context(quiet_page(port, web, f"http://{HOST}:{data}"))
         self.data_url = f"rerun+http://{HOST}:{data}/proxy"
         shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
         self.page_url = f"http://{HOST}:{page.port}/?{shown}"
@@ -102,7 +156,7 @@ class WebViewer(ExitStack):
                 process_group=0,  # Ctrl-C is for us; we end it
                 preexec_fn=end_with_launcher,  # and where we are killed, the kernel does
             )
-        self.callback(_end, self._process)
+        self.callback(end_process, self._process)
         deadline = time.monotonic() + START_S
         while not (_answers(web) and _answers(data)):
             if not self.alive or time.monotonic() > deadline:
@@ -111,7 +165,39 @@ class WebViewer(ExitStack):
             time.sleep(_POLL_S)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+class ViewerPage(WebViewer):
+    """The page, whose address is printed, and opened in a browser of this desktop, once there is something on it."""
+
+    def __init__(self, output: Output, port: int | None = None) -> None:
+        super().__init__(port)
+        self._output = output
+
+    def begin(self) -> RecordingStream:
+        """What writes on it."""
+        from semantic_mapper.replay.rerun_log import recording_server  # loads for a second
+
+        self._output.address("watch at", self.page_url)
+        open_browser(self.page_url)
+        stream = recording_server(self.data_url)
+        self.callback(stream.disconnect)  # before its server ends, which it would complain of at length
+        return stream
+
+    def watch(self, pipeline: MappingPipeline) -> RerunLog:
+        """What shows a session with this pipeline on it."""
+        from semantic_mapper.nodes.viewer.watched_session import WatchedSession
+
+        return WatchedSession(self.begin, pipeline)
+
+    def wait(self, stop: StopRequest) -> None:
+        """Serve it until somebody asks to stop. Raises TransportError: its server has ended."""
+        while not stop:
+            if not self.alive:
+                raise TransportError("the process that serves the viewer has ended; start it again")
+            time.sleep(_POLL_S)
+
+
+def end_process(process: subprocess.Popen[bytes]) -> None:
+    """Ask a process to end, and kill it where it does not."""
     process.terminate()
     try:
         process.wait(STOP_S)
@@ -121,16 +207,19 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 @contextmanager
-def _hold_port(port: int) -> Iterator[int]:
-    """The port itself where it is free, a free one for 0; nobody else gets it meanwhile."""
+def _hold_port(port: int | None, usual: int) -> Iterator[int]:
+    """The port itself where it is free, a free one for 0, and for None the usual one where it is free; nobody else gets
+    it meanwhile."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((HOST, port))
+            probe.bind((HOST, usual if port is None else port))
         except OSError as error:
-            raise TransportError(
-                f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
-            ) from error
+            if port is not None:
+                raise TransportError(
+                    f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
+                ) from error
+            probe.bind((HOST, 0))
         yield probe.getsockname()[1]
 
 

@@ -1,4 +1,4 @@
-"""What the viewer is shown: a saved map, or the nodes and the map of a running system; logs are in ``mapped_log``."""
+"""What the viewer is shown: a saved map, or nodes and map of a running system; ``watched_session`` has logs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 POLL_S = 0.1
+REFRESH_S = 2.0  # between two maps
 GRAPH_S = 5.0  # between two graphs
+FIRST_FRAME_S = 5.0  # a map is shown as of its newest frame, which may never come
 ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
 
 Begin = Callable[[], rr.RecordingStream]  # what is to be shown is open: where does it go?
@@ -102,12 +104,14 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
             return
         log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
         log.note_scale(snapshot.scale_known)
-        show = MapShow(log)
-        show.show(snapshot, time.monotonic_ns())
-        newest_ns = [0]  # stamp of the newest frame
+        show, began = MapShow(log), time.monotonic()
+        newest_ns = [0]  # stamp of the newest frame; cameras and logs may have clocks of their own
 
         def look() -> None:
-            show.show(client.mirror().snapshot(), newest_ns[0] or time.monotonic_ns())
+            if not live.nodes:
+                show.show(client.mirror().snapshot(), time.monotonic_ns())
+            elif newest_ns[0] or time.monotonic() > began + FIRST_FRAME_S:
+                show.show(client.mirror().snapshot(), newest_ns[0])
 
         try:
             with MapFollower(look, refresh_s):

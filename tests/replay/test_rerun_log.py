@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from semantic_mapper.queries.graph import Room, SceneGraph
+from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.replay.exporters.base import MAX_PATH, CameraPath
 from semantic_mapper.replay.rerun_layout import eye_on
-from semantic_mapper.replay.rerun_log import moving_points
+from semantic_mapper.replay.rerun_log import moving_points, room_names
 from semantic_mapper.types import CameraIntrinsics, MapUpdate
 
 SIZE = np.array((5.0, 4.0, 2.6))
@@ -30,14 +32,12 @@ def room(*, ceiling: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("ceiling", [False, True])
-def test_the_first_look_is_into_the_room_not_onto_a_wall(ceiling: bool) -> None:
+def test_the_first_look_is_from_above_into_a_room_without_its_ceiling(ceiling: bool) -> None:
     inside, around = room(ceiling=ceiling)
-    xyz = np.concatenate((inside, around))
-    eye = eye_on(xyz.astype(np.float32), np.array((0.0, 0.0, 1.0)))
+    eye = eye_on(np.concatenate((inside, around)).astype(np.float32), np.array((0.0, 0.0, 1.0)))
     assert np.allclose(eye.up, (0, 0, 1), atol=0.05)
-    within = bool(((eye.position > 0) & (eye.position < SIZE)).all())
-    assert within == ceiling, "a closed room is looked at from inside"
-    assert eye.target[2] < eye.position[2] and ((eye.target > 0) & (eye.target < SIZE)).all(), "it looks down into it"
+    assert (SIZE[2] - 0.3 < eye.ceiling < SIZE[2]) if ceiling else np.isinf(eye.ceiling)
+    assert eye.target[2] < SIZE[2] < eye.position[2] and ((eye.target > 0) & (eye.target < SIZE)).all()
 
 
 def test_what_moves_is_shown_where_it_was_seen() -> None:
@@ -50,6 +50,20 @@ def test_what_moves_is_shown_where_it_was_seen() -> None:
     assert positions is not None
     np.testing.assert_allclose(positions.as_arrow_array().to_pylist(), [(0.5 / 40 * 2, -3.5 / 50 * 2, 2.0)], rtol=1e-5)
     assert not moving_points(dataclasses.replace(update, moving=None), k).positions.as_arrow_array().to_pylist()
+
+
+def test_a_room_is_called_by_the_largest_that_stands_in_it() -> None:
+    things = [
+        Instance(number, 1, name, 0.9, np.zeros(3), OrientedBox(np.zeros(3), np.full(3, size), np.eye(3)), voxels)
+        for number, (name, size) in enumerate(
+            [("chair", 1), ("chair", 1), ("chair", 0.1), ("table", 2), ("window", 3), ("otherprop", 1), ("sofa", 1)]
+        )
+        for voxels in (np.zeros((round(100 * size), 3), np.int32),)
+    ]
+    rooms = tuple(Room(i, 1, 9.0, np.zeros(3), np.zeros((4, 3))) for i in (1, 2))
+    room_of = dict.fromkeys(range(6), 1) | {6: None}
+    graph = SceneGraph(np.array((0.0, 0, 1)), (), rooms, (), tuple(things), room_of)
+    assert room_names(graph) == ["room 1: chairs, table", "room 2"]
 
 
 def test_the_path_of_a_camera_stays_bounded_and_even() -> None:

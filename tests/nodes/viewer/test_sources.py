@@ -14,8 +14,8 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -24,12 +24,11 @@ import rerun.chunk
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.viewer import server
-from semantic_mapper.nodes.viewer.mapped_log import show_log
+from semantic_mapper.nodes.viewer import server, watched_session
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.snapshot import BlockAges, MapMirror
-from semantic_mapper.replay.job_monitor import JobMonitor
+from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
@@ -53,7 +52,7 @@ def logged(path: Path) -> Counter[str]:
 
 
 def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
-    with WebViewer(0, 0) as viewer:
+    with WebViewer(0) as viewer:
         page, data = urlsplit(viewer.page_url), urlsplit(viewer.data_url)
         assert parse_qs(page.query)["url"] == [viewer.data_url]
         assert page.port and data.port
@@ -75,7 +74,7 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
         log.log_map(whole_map().points())
         log.close()  # all of it has been taken
         with pytest.raises(TransportError, match=f"port {page.port} cannot be had"):
-            WebViewer(page.port, 0).__enter__()
+            WebViewer(page.port).__enter__()
         pid = viewer.pid
     assert not is_alive(pid) and not addresses_listening(page.port) and not addresses_listening(data.port)
     assert not settings.exists()
@@ -102,14 +101,14 @@ def test_a_viewer_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pyte
     program.write_text(f"#!{sys.executable} -I\nimport sys\n{locked}\n")
     program.chmod(0o755)
     monkeypatch.setattr(server, "PROGRAM", program)
-    with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0, 0):
+    with pytest.raises(TransportError, match=r"has not started.* the door is locked"), WebViewer(0):
         pass
 
 
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
     program = (
         "import time\nfrom semantic_mapper.nodes.viewer.server import WebViewer\n"
-        "with WebViewer(0, 0) as viewer:\n    print(viewer.pid, flush=True)\n    time.sleep(600)\n"
+        "with WebViewer(0) as viewer:\n    print(viewer.pid, flush=True)\n    time.sleep(600)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         server = int(process.stdout.readline())
@@ -119,12 +118,14 @@ def test_a_viewer_that_is_killed_leaves_no_server() -> None:
     assert eventually(lambda: not is_alive(server), 10)
 
 
-def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
-    monitor, path = Mock(spec=JobMonitor), tmp_path / "log.rrd"
-    options = (5, lambda: recording_file(path), 0.0, lambda: monitor.set.call_count < 3, monitor)
-    show_log(log, weights, tiny_config(), *options)
-    monitor.start.assert_called_once_with(5)
-    assert monitor.set.call_count == 3, "asked to end after the third frame"
+def test_a_log_is_mapped_and_shown_with_all_colourings(
+    log: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("REFRESH_S", 0.0), ("PAUSE", 0.0), ("IMAGE_S", 0.0)):
+        monkeypatch.setattr(watched_session, name, value)
+    path = tmp_path / "log.rrd"
+    watch = partial(watched_session.WatchedSession, lambda: recording_file(path))
+    replay_log(log, tmp_path / "out", weights, tiny_config(), max_frames=3, watch=watch)
     rows = logged(path)
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
     assert rows[f"{camera}/rgb"] == rows[f"{camera}/semantics"] == rows[f"{camera}/depth"] == 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -168,10 +169,10 @@ def test_rerun_shows_what_was_measured_and_where_things_were_that_have_gone(corn
     log.log_graph(find_graph(corner), [thing])
     log.finish(voxel_map.points())
     chunks = {chunk.entity_path: chunk for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
-    cloud = chunks["/world/map/measured"].to_record_batch()
-    colors = np.array(cloud.column("Points3D:colors").to_pylist()[0], np.uint32)
-    for flag, color in ((True, MEASURED_COLOR), (False, COMPUTED_COLOR)):
-        assert set((colors[measured == flag] >> 8).tolist()) == {int.from_bytes(bytes(color), "big")}
+    parts = [chunks[f"/world/map/measured{part}"].to_record_batch() for part in ("", "/ceiling")]
+    colors = Counter(color >> 8 for part in parts for color in part.column("Points3D:colors").to_pylist()[0])
+    shown = {int.from_bytes(bytes(c), "big"): n for c, n in ((MEASURED_COLOR, measured), (COMPUTED_COLOR, ~measured))}
+    assert colors == {color: of.sum() for color, of in shown.items()}
     found = chunks["/world/graph/gone"].to_record_batch()
     assert found.column("Boxes3D:labels").to_pylist() == [["table 7, gone at 2.5 s"]]
     np.testing.assert_allclose(found.column("Boxes3D:centers").to_pylist()[0], [(1, 2, 3)])
