@@ -6,10 +6,6 @@ SHELL := /bin/bash
 
 PYTHON ?= python3
 READY := .venv/.ready
-# Modules whose classes and functions the reference describes; what they import is left out.
-API := semantic_mapper semantic_mapper.types semantic_mapper.geometry semantic_mapper.rays semantic_mapper.labels \
-	semantic_mapper.config semantic_mapper.errors semantic_mapper.testing semantic_mapper.mapping.map_types \
-	semantic_mapper.fields.base semantic_mapper.evaluation.metrics
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
 # Two test processes, with one thread of computation each. A worker that crashes ends the run with an error.
@@ -73,8 +69,9 @@ bench: $(READY)  ## measure speed
 wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check them
 	.venv/bin/python -m tools.wheels
 
-docs: $(READY)  ## build the reference of the Python interface into dist/docs/
-	.venv/bin/pdoc --docformat google --output-directory dist/docs $(API)
+docs: $(READY)  ## build the site of all pages into dist/docs/; broken links are errors
+	.venv/bin/python -m sphinx -c docs -b html -q -W --keep-going . dist/docs
+	@echo "open dist/docs/README.html"
 
 format: $(READY)  ## format and fix what can be fixed automatically
 	.venv/bin/ruff format .

@@ -70,23 +70,3 @@ def test_no_file_names_a_machine_or_a_package_index() -> None:
         found = foreign.search(path.read_text(encoding="utf-8"))
         named += [f"{name}: {found.group()}"] if found else []
     assert not named
-
-
-def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
-    broken = []
-    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "research").rglob("*.md")):
-        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
-            if "://" in target:
-                continue
-            other = page.parent / target if target else page
-            if not other.exists() or anchor not in {"", *anchors(other)}:
-                broken.append(f"{page.relative_to(ROOT)}: {target}#{anchor}")
-    assert not broken
-
-
-def anchors(page: Path) -> list[str]:
-    """The anchors that a forge gives the headings of a page."""
-    if page.suffix != ".md":
-        return []
-    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]

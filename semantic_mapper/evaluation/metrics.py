@@ -176,7 +176,7 @@ class ConfidenceScores:
 
 
 def calibration_error(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> float | None:
-    """Expected calibration error: mean over the samples of |accuracy - confidence| of their bin; None without samples.
+    """Expected calibration error, mean over the samples: accuracy of their bin against its confidence; None for none.
 
     Of bins (B,) of confidence: how many samples, the sum of their confidences, and how many are right.
     """
