@@ -15,7 +15,7 @@ PYTEST := OMP_NUM_THREADS=1 $(TESTS)
 # Without bytecode, each process that a test starts would compile its packages again: seconds of CPU.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-loaded test-gate test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
+.PHONY: help setup slim demo test test-loaded test-gate test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -26,7 +26,10 @@ $(READY): pyproject.toml uv.lock setup.py $(KERNELS) tools/setup.sh tools/system
 	PYTHON=$(PYTHON) tools/setup.sh
 	@touch $@
 
-demo: $(READY)  ## map an embedded scene; results in runs/demo
+slim:  ## make .venv with what mapping needs, without CUDA and developers' tools
+	PYTHON=$(PYTHON) tools/setup.sh --slim
+
+demo: $(or $(wildcard .venv/.slim),$(READY))  ## map an embedded scene; results in runs/demo
 	.venv/bin/semantic-mapper demo --out runs/demo
 
 test: $(READY)  ## run the quick tests
@@ -49,6 +52,8 @@ nightly: $(READY)  ## run all tests, those of research, and everything on a bare
 	$(PYTEST)
 	$(MAKE) test-research
 	tools/bare_machine.sh "make demo && make test"
+	tools/bare_machine.sh --suite trixie "apt-get update -qq && apt-get install -qq --no-install-recommends \
+		python3-torch && make slim && du -sm .venv && make demo && .venv/bin/semantic-mapper doctor"
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m research.experiments.v4l2_machine

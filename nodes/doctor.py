@@ -17,6 +17,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.mapping.open3d_loader import SYSTEM_PACKAGES, open3d_version
 from semantic_mapper.memory import is_out_of_memory
 from semantic_mapper.nodes.process import usable_cores
 from semantic_mapper.transport.codec import encode
@@ -25,6 +26,8 @@ from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 PROBE_TIMEOUT_S = 180.0  # a cold disk takes long to give Open3D's 400 MB
+CHECKOUT = (Path(__file__).parents[2] / "Makefile").is_file()
+INSTALL = "make setup" if CHECKOUT else f"{sys.executable} -m pip install --upgrade semantic-mapper"
 DISK_GB = 2.0
 MEMORY_GB = 3.0
 
@@ -49,14 +52,15 @@ def _packages() -> Iterator[Check]:
     for requirement in map(Requirement, metadata.requires("semantic-mapper") or ()):
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue  # of an extra, or for another platform
+        name = requirement.name
         try:
-            version = metadata.version(requirement.name)
+            version = open3d_version() if name == "open3d" else metadata.version(name)
             if not requirement.specifier.contains(version, prereleases=True):
-                wrong.append(f"{requirement.name} {version}, not {requirement.specifier}")
+                wrong.append(f"{name} {version}, not {requirement.specifier}")
         except metadata.PackageNotFoundError:
-            wrong.append(f"{requirement.name} is missing")
+            wrong.append(f"{name} is missing")
     found = f"{'; '.join(wrong) or 'all that is needed'}, Python {platform.python_version()} at {sys.executable}"
-    yield Check("packages", "bad" if wrong else "ok", found, "make setup" if wrong else "")
+    yield Check("packages", "bad" if wrong else "ok", found, INSTALL if wrong else "")
 
 
 def _open3d() -> Iterator[Check]:
@@ -73,7 +77,7 @@ def _open3d() -> Iterator[Check]:
         return
     ended = f"ended by {signal.Signals(-done.returncode).name}" if done.returncode < 0 else ""
     last = done.stderr.strip().splitlines()[-1:] or [ended]
-    fix = "make setup (fetches missing system libraries into .venv/syslibs); its wheels need glibc 2.35 or newer"
+    fix = f"{'make setup' if CHECKOUT else f'apt-get install {SYSTEM_PACKAGES}'}; its wheels need glibc 2.35 or newer"
     yield Check("Open3D", "bad", last[0], fix)
 
 
@@ -83,7 +87,7 @@ def _torch() -> Iterator[Check]:
     except ImportError as error:
         if is_out_of_memory(error):  # all that follows would fail, too
             raise
-        yield Check("torch", "bad", str(error), "make setup")
+        yield Check("torch", "bad", str(error), INSTALL)
         return
     yield Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads")
     if torch.cuda.is_available():

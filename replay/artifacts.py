@@ -23,6 +23,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.formats import write_ply
 from semantic_mapper.mapping.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scale_name, voxel_size_text
+from semantic_mapper.mapping.open3d_loader import open3d_version
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import find_graph
@@ -41,7 +42,7 @@ OVERVIEW_FRAMES = 2
 MIN_POINTS_A_BLOCK = 2
 OVERVIEW_NAME, REPORT_NAME = "overview.png", "report.html"
 STRIPS = 4  # frames that the report shows
-PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
+PACKAGES = ("torch", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
 def finish_session(
@@ -285,7 +286,7 @@ def _rounded(value: float | None, digits: int = 2) -> float | None:
 
 def versions() -> dict[str, str]:
     """Versions of this project, Python and the packages that decide a result."""
-    found = {"semantic_mapper": __version__, "python": platform.python_version()}
+    found = {"semantic_mapper": __version__, "python": platform.python_version(), "open3d": open3d_version()}
     return found | {name: metadata.version(name) for name in PACKAGES}
 
 

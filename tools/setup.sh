@@ -1,5 +1,7 @@
 #!/usr/bin/env bash
 # Make .venv as uv.lock says, with the Python at hand. Needs Python >= 3.11 with pip; no root, no venv module.
+# --slim: what mapping needs, without CUDA and developers' tools. PyTorch is that of the system's Python (Debian 13:
+# python3-torch), else PyTorch's own build for the CPU.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -25,6 +27,18 @@ cache="${UV_CACHE_DIR:-${XDG_CACHE_HOME:-${HOME:-/nonexistent}/.cache}/uv}"
 if ! mkdir -p "$cache" 2>/dev/null || [[ ! -w $cache ]]; then
   export UV_CACHE_DIR="$PWD/.tools/cache"  # a home that cannot be written to
 fi
-"$uv" sync --frozen --all-extras --python "$python"
+if [[ ${1:-} == --slim ]]; then
+  "$uv" venv --quiet --clear --system-site-packages --python "$python" .venv
+  "$uv" export --quiet --frozen --no-dev --no-hashes --no-emit-project --extra foxglove --extra realsense \
+    --prune torch --output-file .tools/slim.txt >/dev/null
+  # The wheel of Open3D for x86-64 has CUDA in it; its builds without have a name of their own.
+  if [[ $(uname -m) == x86_64 ]]; then sed -i 's/^open3d==/open3d-cpu==/' .tools/slim.txt; fi
+  "$uv" pip install --python .venv --no-deps -r .tools/slim.txt -e .
+  .venv/bin/python -c 'import torch' 2>/dev/null || "$uv" pip install --python .venv --torch-backend cpu 'torch>=2.5'
+  touch .venv/.slim
+else
+  if [[ -e .venv/.slim ]]; then rm -rf .venv; fi
+  "$uv" sync --frozen --all-extras --python "$python"
+fi
 
 .venv/bin/python tools/system_libs.py

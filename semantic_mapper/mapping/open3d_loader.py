@@ -7,6 +7,7 @@ import ctypes
 import functools
 import importlib
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from semantic_mapper.errors import DependencyError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.memory import is_out_of_memory, memory_message
 
+SYSTEM_PACKAGES = "libgl1 libegl1 libx11-6 libgomp1"  # of Debian and Ubuntu, which its wheel needs
 _log = get_logger(__name__)
 
 
@@ -27,13 +29,21 @@ def load_open3d() -> Any:
         if is_out_of_memory(error):
             raise DependencyError(f"Open3D cannot be loaded: {memory_message(error)}") from error
         raise DependencyError(
-            f"Open3D cannot be loaded: {error}. Run `make setup`, or install what is missing (Debian/Ubuntu: `apt-get "
-            "install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1`; glibc 2.35 or newer is needed)."
+            f"Open3D cannot be loaded: {error}. Install what is missing: `apt-get install {SYSTEM_PACKAGES}` (Debian, "
+            "Ubuntu), or run `make setup` in a checkout; glibc 2.35 or newer is needed."
             + "".join(f" [{note}]" for note in notes)
         ) from error
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     _log.debug("open3d_loaded", version=open3d.__version__, preload_failures=notes)
     return open3d
+
+
+def open3d_version() -> str:
+    """Version of the installed package. Raises PackageNotFoundError: it is not installed."""
+    try:
+        return metadata.version("open3d")
+    except metadata.PackageNotFoundError:
+        return metadata.version("open3d-cpu")  # its build without CUDA
 
 
 def preload_libraries() -> list[str]:
