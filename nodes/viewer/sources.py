@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 import structlog
 from numpy.typing import NDArray
 
@@ -20,7 +21,6 @@ from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
-from semantic_mapper.replay.rerun_layout import rr
 from semantic_mapper.replay.rerun_log import RerunLog
 from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.messages import EndOfStream
