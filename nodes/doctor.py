@@ -76,9 +76,9 @@ def _open3d() -> Iterator[Check]:
         yield Check("Open3D", "ok", f"{''.join(done.stdout.split()[-1:])} loads")  # loading it may print, too
         return
     ended = f"ended by {signal.Signals(-done.returncode).name}" if done.returncode < 0 else ""
-    last = done.stderr.strip().splitlines()[-1:] or [ended]
+    last = (done.stderr.strip().splitlines()[-1:] or [ended])[0].partition("DependencyError: ")
     fix = f"{'make setup' if CHECKOUT else f'apt-get install {SYSTEM_PACKAGES}'}; its wheels need glibc 2.35 or newer"
-    yield Check("Open3D", "bad", last[0], fix)
+    yield Check("Open3D", "bad", (last[2] or last[0]).partition(". Install")[0], fix)
 
 
 def _torch() -> Iterator[Check]:
