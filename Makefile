@@ -62,7 +62,8 @@ test-web: $(READY)  ## try the labelling page in a headless browser
 	.venv/bin/python -m tests.browser
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
-check: $(READY)  ## formatting, lint, types, import contracts
+check: $(READY)  ## formatting, lint, types, import contracts, uv.lock against pyproject.toml
+	.tools/bin/uv lock --check --quiet
 	.venv/bin/ruff format --check .
 	.venv/bin/ruff check .
 	.venv/bin/pyright
