@@ -16,7 +16,7 @@ import numpy as np
 
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, adjust_bundle, triangulate
 from semantic_mapper.bundle.picture_checks import PictureChecker
-from semantic_mapper.bundle.scale import ScaleEstimator, floor_height
+from semantic_mapper.bundle.scale import ScaleEstimator, find_floor
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres
@@ -263,9 +263,9 @@ class VisualOdometry:
         """
         if not self._map.points:
             return None
-        camera = float(np.median([k.T_world_camera[:3, 3] @ up for k in self._map.keyframes]))
-        floor = floor_height(np.stack(list(self._map.points.values())) @ up, camera)
-        return None if floor is None else camera - floor
+        camera = np.median([k.T_world_camera[:3, 3] for k in self._map.keyframes], axis=0)
+        floor = find_floor(np.stack(list(self._map.points.values())), camera, up)
+        return None if floor is None else floor.below
 
     def center_depth(self) -> float | None:
         """Median distance along the view of points in the middle third of the view that the world begins with; None

@@ -13,7 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.bundle.scale import floor_height
+from semantic_mapper.bundle.scale import Floor, find_floor
 from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
@@ -63,6 +63,9 @@ FOLLOWED = 2.5 * STEP  # motion since the last registered frame within which a f
 MAX_POINT_ERROR_PX = 2.0  # points that are less exact are no guide
 EDGE_FRAMES = 60  # about as many are searched for upright edges
 PACKING = CodecOptions(rgb="jpeg", jpeg_quality=95)  # a film has lost more already
+
+FLOOR_CONE_DEG = 12.0  # how far up may be off where no edges tell it
+LATER = "`semantic-mapper scale` takes a known length of the map"
 
 CAMERA_ID = "camera"  # in the log
 
@@ -281,10 +284,15 @@ class _Import:
             frames[picked[int(image.name)]] = RegisteredFrame(image.T_world_camera, image.xy[exact], xyz)
         guess = camera_up(np.stack([frame.T_world_camera for frame in frames.values()]))
         up = vertical(self._edges, _poses(frames), seen, guess)
-        if up is None:
-            self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         T_level_world = upright(frames[min(frames)].T_world_camera, guess if up is None else up)
         frames = _moved(frames, T_level_world, UNSCALED_DEPTH_M / median_depth(list(frames.values())))
+        floor = _floor(frames, 0.0 if up is not None else FLOOR_CONE_DEG)
+        if up is None and floor is not None:
+            frames = _moved(frames, upright(frames[min(frames)].T_world_camera, floor.up), 1.0)
+            floor = _floor(frames, 0.0) or floor
+        if up is None:
+            by = "how the camera was held" if floor is None else "square to the floor that was found"
+            self._notices.append(f"up is {by}: too few upright edges are seen to tell it better")
         fit = None
         if self._options.scale == ScaleHint():
             try:
@@ -296,29 +304,40 @@ class _Import:
             T_world_model = fit.T_world_model.copy()
             T_world_model[:3, 3] /= fit.scale
             frames = _moved(frames, T_world_model, fit.scale)
-            return _Scene(frames, seen, str(fit), _floor_and_height(frames)[1], str(fit.origin))
-        factor, scale = self._scale(frames, seen)
-        frames = _moved(frames, np.eye(4), factor)
-        floor, height = _floor_and_height(frames)
+            return _Scene(frames, seen, str(fit), None if floor is None else fit.scale * floor.below, str(fit.origin))
+        try:
+            factor, scale = self._scale(frames, seen, floor)
+        except ImportSourceError as error:  # nobody waits for the poses again: `scale` takes a length later
+            factor, scale = 1.0, ""
+            self._notices.append(f"the scale is unknown: lengths of the log are not metres, since {error}")
         down = np.eye(4)
-        down[2, 3] = -floor
-        return _Scene(_moved(frames, down, 1.0), seen, scale, height, "")
+        if floor is not None:
+            down[2, 3] = floor.below - _middle(frames)[2]
+        height = None if floor is None else factor * floor.below
+        return _Scene(_moved(frames, down, factor), seen, scale, height, "")
 
-    def _scale(self, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics) -> tuple[float, str]:
-        """Metres per unit, and how they were found; empty = they were not."""
+    def _scale(
+        self, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics, floor: Floor | None
+    ) -> tuple[float, str]:
+        """Metres per unit, and how they were found; empty = they were not. Raises ImportSourceError: what was to tell
+        them does not."""
         hint = self._options.scale
         if hint.factor is not None:
             return hint.factor, f"given: {hint.factor:g} m per unit"
         if self._board is not None:
             return scale_by_board(self._board_seen, _poses(frames), seen)
         if hint.camera_height_m is not None:
-            _, height = _floor_and_height(frames)
-            if height is None:
+            if floor is None:
                 raise ImportSourceError(
-                    f"{self._film.path}: no floor is found under the camera, so its height tells no scale; film more "
-                    "of the floor, or give the scale in another way"
+                    f"no floor is found under the camera for its height; {LATER}, or film more of the floor"
                 )
-            return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
+            said = f"camera {hint.camera_height_m:g} m over a floor of {floor.points} points"
+            if floor.unsure:
+                said += ", unsure"
+                self._notices.append(
+                    f"little of the floor is seen ({floor.points} points): the scale may be a tenth off; {LATER}"
+                )
+            return hint.camera_height_m / floor.below, said
         if hint.distance is not None:
             *marks, metres = hint.distance
             a, b = (self._marked_place(mark, frames, seen) for mark in marks)
@@ -328,7 +347,7 @@ class _Import:
             return metres / found, f"two marked points, {metres:g} m apart"
         self._notices.append(
             "the scale is unknown: lengths of the log are not metres. Give one of --scale, --distance, --square-mm "
-            "(with a printed board in the film) or --camera-height"
+            f"(with a printed board in the film) or --camera-height; {LATER}"
         )
         return 1.0, ""
 
@@ -454,11 +473,15 @@ def _moved(frames: dict[int, RegisteredFrame], T: Float64, scale: float) -> dict
     return result
 
 
-def _floor_and_height(frames: dict[int, RegisteredFrame]) -> tuple[float, float | None]:
-    """z of the floor, where z is up, and the camera's median height over it; 0 and None if no floor is found."""
-    camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames.values()]))
-    floor = floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames.values()]), camera_z)
-    return (0.0, None) if floor is None else (floor, camera_z - floor)
+def _floor(frames: dict[int, RegisteredFrame], cone_deg: float) -> Floor | None:
+    """The floor under the cameras, where z is up, or up to ``cone_deg`` off it; by points that three frames see."""
+    xyz, seen = np.unique(np.concatenate([frame.xyz for frame in frames.values()]), axis=0, return_counts=True)
+    return find_floor(xyz[seen >= 3], _middle(frames), np.array((0.0, 0.0, 1.0)), cone_deg)
+
+
+def _middle(frames: dict[int, RegisteredFrame]) -> Float64:
+    """The median (3,) of the positions."""
+    return np.median([frame.T_world_camera[:3, 3] for frame in frames.values()], axis=0)
 
 
 def _parallax_deg(model: colmap.ColmapModel) -> float:

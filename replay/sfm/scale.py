@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from semantic_mapper.bundle.scale import cone
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
@@ -247,7 +248,7 @@ def vertical(
 
     best = guess / np.linalg.norm(guess)
     for cone_deg, step_deg in ((CONE_DEG, 1.5), (1.5, 0.25)):
-        directions = _cone(best, cone_deg, step_deg)
+        directions = cone(best, cone_deg, step_deg)
         best = directions[int(np.argmax(weight @ near(directions.T)))]
     for _ in range(5):
         agree = near(best)
@@ -256,16 +257,3 @@ def vertical(
         _, axes = np.linalg.eigh((planes[agree] * weight[agree, None]).T @ planes[agree])
         best = axes[:, 0] * np.sign(axes[:, 0] @ best)
     return best if weight[near(best)].sum() > MIN_SUPPORT * weight.sum() else None
-
-
-def _cone(axis: Float64, half_deg: float, step_deg: float) -> Float64:
-    """Unit directions (N, 3) within an angle of an axis, about a step apart; the axis comes first."""
-    side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    side /= np.linalg.norm(side)
-    rows = [axis]
-    for tilt in np.radians(np.arange(step_deg, half_deg + 1e-9, step_deg)):
-        count = max(6, int(np.ceil(2 * np.pi * np.sin(tilt) / np.radians(step_deg))))
-        turn = np.arange(count)[:, None] * 2 * np.pi / count
-        ring = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
-        rows += list(np.cos(tilt) * axis + np.sin(tilt) * ring)
-    return np.stack(rows)

@@ -39,6 +39,7 @@ from semantic_mapper.replay.importers.folder import open_folder
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.reconstruct import PACKING, FilmOptions, import_film
+from semantic_mapper.replay.sfm.scale import ScaleHint
 from semantic_mapper.transport.messages import SCALE_KEY
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
@@ -55,15 +56,18 @@ class Walk:
     hz: float
     focal_px: float
     size: tuple[int, int]
+    T_level_world: Float64  # (4, 4) to a world with z up, its floor at 0
 
 
-def recorded_walk(folder: Path) -> Walk:
-    """The pictures of a sequence folder."""
+def recorded_walk(folder: Path, first: int, count: int) -> Walk:
+    """Some pictures of a sequence folder; ``mesh_labels.npz`` beside them says where its floor is."""
     recording = open_folder(folder, ImportOptions())
-    frames = [recording.load(n).frame for n in range(len(recording))]
+    frames = [recording.load(n).frame for n in range(first, min(first + count, len(recording)))]
     k = frames[0].intrinsics
     poses = np.stack([f.T_world_camera for f in frames])
-    return Walk((f.rgb for f in frames), poses, recording.info.frame_hz, k.fx, (k.width, k.height))
+    mesh = folder / "mesh_labels.npz"
+    level = np.load(mesh)["T_gravity"] if mesh.exists() else np.eye(4)
+    return Walk((f.rgb for f in frames), poses, recording.info.frame_hz, k.fx, (k.width, k.height), level)
 
 
 def room_walk(seed: int, count: int, width: int, step_m: float, shutter: float) -> Walk:
@@ -100,7 +104,7 @@ def room_walk(seed: int, count: int, width: int, step_m: float, shutter: float) 
             yield picture
 
     true = [interpolate_pose(poses[n], poses[min(n + 1, count - 1)], shutter / 2) for n in range(count)]
-    return Walk(pictures(), np.stack(true), ROOM_HZ, k.fx, (width, height))
+    return Walk(pictures(), np.stack(true), ROOM_HZ, k.fx, (width, height), np.eye(4))
 
 
 def write_film(path: Path, walk: Walk) -> None:
@@ -130,7 +134,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--focal-error", type=float, default=0.1, help="of the guess; nan = no guess")
     parser.add_argument("--seed", type=int, default=200_003)
+    parser.add_argument("--first", type=int, default=0, help="frame of a sequence folder")
     parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--camera-height", action="store_true", help="scale by the true height over the floor")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--step", type=float, default=0.03)
     parser.add_argument("--rolling-shutter", type=float, default=0.0)
@@ -139,14 +145,15 @@ def main() -> None:
     if given.walk == "rooms":
         walk = room_walk(given.seed, given.frames, given.width, given.step, given.rolling_shutter)
     else:
-        walk = recorded_walk(Path(given.walk))
+        walk = recorded_walk(Path(given.walk), given.first, given.frames)
     film = given.out / "film.mp4"
     write_film(film, walk)
     prior = None if np.isnan(given.focal_error) else walk.focal_px * (1 + given.focal_error)
     began = time.process_time()
-    report = import_film(
-        film, given.out / "film.mcap", FilmOptions(focal_prior_px=prior), lambda *_: None, overwrite=True
-    )
+    height_m = float(np.median((walk.T_level_world @ walk.poses)[:, 2, 3]))
+    hint = ScaleHint(camera_height_m=height_m) if given.camera_height else ScaleHint()
+    options = FilmOptions(focal_prior_px=prior, scale=hint)
+    report = import_film(film, given.out / "film.mcap", options, lambda *_: None, overwrite=True)
     child = resource.getrusage(resource.RUSAGE_CHILDREN)
     with LogReader(given.out / "film.mcap") as log:
         seqs = [frame.seq for frame in log]
@@ -156,7 +163,7 @@ def main() -> None:
     aligned = transform(T, scale * found)
     write_aligned(given.out / "film.mcap", T, scale)
     off = np.linalg.norm(aligned - true, axis=1)
-    up = T[:3, 2]
+    up = walk.T_level_world[:3, :3] @ T[:3, 2]
     figures = {
         "frames": len(walk.poses),
         "in the log": len(report.T_world_camera),
@@ -165,9 +172,11 @@ def main() -> None:
         "left out": report.note.left_out,
         "ATE, cm": {n: round(100 * float(v), 2) for n, v in (("rmse", np.sqrt((off**2).mean())), ("max", off.max()))},
         "way, m": round(float(np.linalg.norm(np.diff(walk.poses[:, :3, 3], axis=0), axis=1).sum()), 2),
+        "scale": report.scale or "unknown",
+        "scale off, %": round(100 * (1 / scale - 1), 2) if report.scale else None,
         "focal, px": {"true": walk.focal_px, "guess": prior, "found": round(report.note.focal_px, 1)},
         "reprojection, px": round(report.note.error_px, 3),
-        "up off the true z, deg": round(float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))), 2),
+        "up off the true one, deg": round(float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))), 2),
         "CPU s": round(time.process_time() - began + child.ru_utime + child.ru_stime, 1),
         "notices": report.notices,
     }

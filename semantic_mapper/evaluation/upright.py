@@ -12,7 +12,9 @@ from semantic_mapper.types import Float32, Float64
 SAMPLE = 20_000  # points that the searches look at
 BIN_M = 0.02  # of the histograms whose sharpness is measured
 TILT_DEG = 10.0  # how far the refinement may turn the first guess
-MIN_TURN = 0.05  # mean square of the level axes' second direction: a camera that turned about 13 degrees either way
+# Mean square of the level axes' second direction: a camera that turned about 6 degrees either way; and how many times
+# that of the third, its roll.
+MIN_TURN, MIN_TURN_TO_ROLL = 0.01, 2.0
 SLAB_M = 0.15  # thickness within which a ceiling lies
 CELL_M = 0.1  # of the floor plan
 SNAP_DEG = 0.5  # nearer to an axis of the world than the search can tell apart: it is that axis
@@ -30,7 +32,7 @@ def camera_up(T_world_camera: Float64) -> Float64:
     image_up = -T_world_camera[:, :3, 1].mean(axis=0)
     level = T_world_camera[:, :3, 0]
     spread, axes = np.linalg.eigh(level.T @ level / len(level))
-    if spread[1] < MIN_TURN:
+    if spread[1] < max(MIN_TURN, MIN_TURN_TO_ROLL * spread[0]):
         return image_up / np.linalg.norm(image_up)
     return axes[:, 0] if axes[:, 0] @ image_up > 0 else -axes[:, 0]
 

@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.bundle.scale import floor_height
+from semantic_mapper.bundle.scale import find_floor
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.drivers.poses.board import BoardFinder, make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
-from semantic_mapper.geometry import invert_pose, look_at, project, transform
+from semantic_mapper.geometry import invert_pose, look_at, make_pose, project, transform
 from semantic_mapper.replay.sfm.scale import (
     Mark,
     fit_to_scene,
@@ -33,13 +33,22 @@ def test_marked_distances_are_read() -> None:
             parse_distance(text)
 
 
-def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
-    floor, table = rng.normal(0.0, 0.01, 200), rng.normal(0.75, 0.01, 300)
-    stray = rng.uniform(-0.5, 2.5, 40)
-    found = floor_height(np.concatenate((floor, table, stray)), 1.5)
-    assert found is not None and abs(found) < 0.05
-    assert floor_height(np.concatenate((table, floor[:15])), 1.5) is None  # most is on the table
-    assert floor_height(table + 2.0, 1.5) is None
+def test_the_floor_is_the_lowest_layer_never_a_table(rng: np.random.Generator) -> None:
+    def layer(count: int, z: float, noise: float = 0.01) -> Float64:
+        return np.column_stack((rng.uniform(-1, 1, (count, 2)), rng.normal(z, noise, count)))
+
+    camera, floor, table = np.array((0.0, 0.0, 1.5)), layer(200, 0.0), layer(3000, 0.75)
+    room = np.concatenate((floor, table, layer(9, -0.5, 0.2), layer(300, 1.2, 0.25)))
+    tilted = make_pose(np.radians((7, -6, 50)), np.zeros(3))[:3, :3]
+    for turn, cone_deg in ((np.eye(3), 0.0), (tilted, 12.0)):
+        found = find_floor((room - camera) @ turn.T, np.zeros(3), UP, cone_deg)
+        assert found is not None and found.below == pytest.approx(1.5, rel=0.01) and not found.unsure
+        assert np.degrees(np.arccos(found.up @ turn[:, 2])) < 0.5
+    slope = np.column_stack((rng.uniform(-1, 1, (900, 2)), 1.2 * rng.uniform(0.3, 1, 900) ** 0.5))
+    for points in (np.concatenate((table, layer(60, 0.3, 0.2))), table + 2 * UP, floor[:15], slope):
+        assert find_floor(points, camera, UP) is None
+    few = find_floor(floor[:60], camera, UP)
+    assert few is not None and few.unsure
 
 
 def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:
