@@ -100,46 +100,6 @@ class WebViewer(ExitStack):
         ):
             pass
         page = self.enter_context(quiet_page(port, web, f"http://{HOST}:{data}"))
-        self.data_url = ""  # where to send what is to be shown
-        self.page_url = ""  # what to open in a browser
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def __enter__(self) -> Self:
-        """Start the servers and wait until they answer: ``DependencyError``, ``TransportError`` where they do not."""
-        try:
-            self._start()
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    @property
-    def pid(self) -> int:
-        """Of the servers' process."""
-        assert self._process is not None
-        return self._process.pid
-
-    @property
-    def alive(self) -> bool:
-        """Whether it still serves."""
-        return self._process is not None and self._process.poll() is None
-
-    def _start(self) -> None:
-        folder = self.enter_context(closing(OwnFolder("view-"))).path  # where we are killed, `up` removes it
-        settings = {f"XDG_{kind}_HOME": f"{folder}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
-        environment = {**os.environ, **settings}
-        result = subprocess.run([PROGRAM, "analytics", "disable"], env=environment, capture_output=True, check=False)
-        if result.returncode != 0:  # then it would call home
-            raise DependencyError(f"{PROGRAM}: analytics cannot be switched off: {result.stderr.decode().strip()}")
-        # Ports are held until all are chosen: one that was let go may be given out again. The page answers before there
-        # is anything to show, and so keeps its own.
-        data_port = 0 if self._port == 0 else None
-        with (
-            _hold_port(self._port, WEB_PORT) as port,
-            _hold_port(data_port, DATA_PORT) as data,
-            _hold_port(0, 0) as web,
-        ):
-            page = self.enter_context(quiet_page(port, web, f"http://{HOST}:{data}"))
         self.data_url = f"rerun+http://{HOST}:{data}/proxy"
         shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
         self.page_url = f"http://{HOST}:{page.port}/?{shown}"
