@@ -135,7 +135,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
 _RESULTS = {
     "overview.png": "picture",
     "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
-    "map.npz": "the map itself",
+    "map.npz": "the map itself, for `query`, `view` and `export`",
     "report.html": "report on one page, for a browser",
     "summary.json": "all figures",
 }

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import typer
 
+from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.importing import SourceOptions, import_source
 from semantic_mapper.nodes.cli.verb import (
     EXIT_UNTRUSTED,
@@ -24,6 +25,8 @@ from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.local_server import open_browser
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import ViewerPage
+from semantic_mapper.replay.importers.base import ImportOptions
+from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.run import needs_import
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder
 from semantic_mapper.replay.summary import dig, headlines, notes, result_lines
@@ -79,8 +82,11 @@ def map_(
         if weights is not None:
             load_checkpoint(weights)  # what is wrong with them is said before the long work
         log = out / f"{source[0].resolve().stem}{LOG_SUFFIX}"
+        if log.exists() and is_bag(log):
+            raise LogError(f"{log}: is a bag, which the log would replace; choose another folder by --out")
         with hold_folder(out):
-            with_depth = import_source(output, source[0], log, options, overwrite=True)
+            reading = ImportOptions(max_frames=max_frames or None)  # the rest would not be mapped
+            with_depth = import_source(output, source[0], log, options, reading=reading, overwrite=True)
         source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
     elif options.given:
         raise typer.BadParameter(

@@ -16,8 +16,7 @@ from tools.layouts_page import LAYOUTS, PAGE, files_of, page
 def write(file: Path, text: str) -> None:
     what, _, example = text.partition("\n")
     file.parent.mkdir(parents=True, exist_ok=True)
-    size = re.search(r"(\d+)x(\d+)", what)
-    shape = (int(size[2]), int(size[1])) if size else (480, 640)
+    shape = tuple(map(int, re.findall(r"(\d+)x(\d+)", f"{what} 640x480")[0][::-1]))
     if example:
         file.write_text(example)
     elif file.suffix == ".bin":

@@ -12,7 +12,9 @@ import pytest
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.nodes.cli.importing import SourceOptions, is_film
 from tests.nodes.support import refused, run, run_process
+from tests.replay import bags
 from tests.replay import recordings as rec
+from tests.small import tiny_frames
 
 
 def test_options_become_one_source_of_scale_and_are_refused_for_recordings(tmp_path: Path) -> None:
@@ -60,13 +62,19 @@ def test_what_is_no_film_is_refused_but_not_before_missing_weights_are(tmp_path:
     assert "nope.safetensors" in refused("map", film, "--out", out, "--weights", tmp_path / "nope.safetensors")
 
 
+def test_a_bag_is_not_replaced_by_the_log_of_its_map(tmp_path: Path) -> None:
+    bag = bags.write_bag(tmp_path / "bag", "mcap", bags.room_events(bags.Messages("mcap"), tiny_frames(1)))
+    (file,) = bag.glob("*.mcap")
+    assert "choose another folder" in refused("map", file, "--out", bag) and (bag / "metadata.yaml").exists()
+
+
 @pytest.mark.parametrize("depth", [True, False])
 def test_without_any_depth_other_weights_map(tmp_path: Path, depth: bool, capfd: pytest.CaptureFixture[str]) -> None:
     folder = rec.make_folder(tmp_path / "kitchen")
     if not depth:
         shutil.rmtree(folder / "depth")
     (folder / "color" / sorted(file.name for file in (folder / "color").iterdir())[1]).write_bytes(b"damaged")
-    done = run("map", folder, "--out", tmp_path / "out")
+    done = run("map", folder, "--out", tmp_path / "out", "--max-frames", "3")
     said = done.stderr + capfd.readouterr().err
     assert ("rooms-computed-depth.safetensors" in said) != depth and "mapping" in said
-    assert "frame left out: frame 1" in done.stdout  # what `import` says is not lost
+    assert "2 frames" in done.stdout and "frame left out: frame 1" in done.stdout  # what `import` says is not lost

@@ -35,12 +35,11 @@ def test_replay_writes_map_picture_and_summary(replayed: Path) -> None:
     assert json.loads((replayed / "stdout.txt").read_text()) == summary, "JSON stands alone on stdout"
 
 
-def test_missing_weights_unknown_settings_and_bad_corrections_are_named(log: Path, tmp_path: Path) -> None:
+def test_unknown_settings_and_bad_corrections_are_named(log: Path, tmp_path: Path) -> None:
     wrong, corrections = tmp_path / "wrong.toml", tmp_path / "corrections.txt"
     wrong.write_text("[voxel_map]\nvoxel_sise_m = 0.05\n")
     corrections.write_text("no trajectory\n")
     for option, file, said in (
-        ("--weights", tmp_path / "none.safetensors", "none.safetensors: no such weights file"),
         ("--config", wrong, "did you mean `voxel_size_m`?"),
         ("--corrections", corrections, "corrections.txt: holds no pose"),
     ):
