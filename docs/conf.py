@@ -25,7 +25,7 @@ _HOW_TO = ["recordings", "cameras", "robots", "scenes", "fleet"]
 MENU = {
     "README": {
         "How to": [f"docs/{name}" for name in _HOW_TO],
-        "Reference": ["docs/settings", "docs/python", "docs/model-card", "CHANGELOG"],
+        "Reference": ["docs/layouts", "docs/settings", "docs/python", "docs/model-card", "CHANGELOG"],
         "The project": ["docs/architecture", "docs/decisions/README", "research/docs/experiments", "CONTRIBUTING"],
     },
     "docs/robots": {"Examples": ["examples/robot/README"]},
