@@ -18,7 +18,6 @@ from tests.small import tiny_frames
 
 
 def test_options_become_one_source_of_scale_and_are_refused_for_recordings(tmp_path: Path) -> None:
-    assert SourceOptions().film_options().scale.factor is None
     found = SourceOptions(scale=1.5, rotate="90").film_options()
     assert found.scale.factor == 1.5 and found.quarters == 1
     board = SourceOptions(square_mm=39.6).film_options().scale.board

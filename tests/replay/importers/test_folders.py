@@ -338,9 +338,7 @@ def test_laser_scans_give_depth_to_both_cameras(tmp_path: Path) -> None:
         assert len(row) == 1 and frame.depth_m[row, column] == pytest.approx(4.0, abs=0.05)
         assert abs(column[0] - (k.cx - k.fx * shift_m / 4)) < 1.5 and abs(row[0] - k.cy) < 1.5
     assert later.depth_m is None
-
-
-def test_a_scan_fills_the_pixels_between_its_beams() -> None:
+    # A scan fills the pixels between its beams.
     camera = CameraIntrinsics(552.6, 552.6, 100.0, 50.0, 200, 100)
     depth = depth_of_scan(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 9.0]]), np.eye(4), camera)
     row, column = np.nonzero(depth)
