@@ -79,6 +79,8 @@ def finish_session(
     summary |= {"stopped_by": stopped_by or None, "restarted": restarted or None}
     if summary["map"]["nearly_empty"]:
         _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
+    elif session.range_warning:
+        _log.warning("depth_out_of_range", reason=session.range_warning)
     write_json(out / SUMMARY_FILE, summary)
     progress()
     graph = find_graph(voxel_map)
@@ -124,6 +126,8 @@ def _subtitles(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]
         yield "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)"
     if summary["map"]["nearly_empty"]:
         yield "MAP NEARLY EMPTY (see summary.json)"
+    if summary["depth"]["range_warning"]:
+        yield "DEPTH OUT OF RANGE (see summary.json)"
     if (miou := summary["metrics"]["miou"]) is not None:
         yield f"mIoU {percent(miou)} over {session.scored} labelled frames that the weights have not seen"
     else:
@@ -147,14 +151,17 @@ def _nearly_empty(session: MapSession, points: int) -> str | None:
     """Why a map of this many surface points has hardly any for the space that its frames measured, and what to do; None
     where it has, or where no frame had depth to map."""
     blocks = session.pipeline.voxel_map.block_count
-    mapped = max(session.fused, session.computed_depth)  # a camera that stands still fuses nothing
+    # A camera that stands still fuses nothing, nor does one that sees only what is too far.
+    mapped = max(session.fused, session.computed_depth, session.too_far)
     if not mapped or (points and points >= MIN_POINTS_A_BLOCK * blocks):
         return None
     why = (
         "their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
         "(T_world_camera, metres, stamped with the time of capture)"
     )
-    if 2 * session.without_depth >= mapped:
+    if session.range_warning:
+        why = session.range_warning
+    elif 2 * session.without_depth >= mapped:
         why = (
             f"{session.without_depth} of them have no sensor depth, and depth that the field renders does not agree "
             "from frame to frame: record or import depth images, too; or have depth computed from the pictures "
@@ -261,6 +268,9 @@ def _depth_source(session: MapSession) -> dict[str, Any]:
         "rendered_fraction": round(rendered, 4),
         "computed_fraction": round(computed, 4),
         "too_little_motion": session.too_little_motion,
+        "too_far_fraction": round(session.too_far / session.with_depth, 4) if session.with_depth else None,
+        "computed_too_far": bool(session.range_warning and computed),
+        "range_warning": session.range_warning or None,
         "given_poses_off_px": given_px,
         "refined_poses_off_px": refined_px,
     }

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from semantic_mapper.config import MapperConfig
-from semantic_mapper.errors import LabelError, LogError, SemanticMapperError, WeightsError
+from semantic_mapper.errors import EmptyMapError, LabelError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.nesf import find_nesf
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -63,8 +63,8 @@ def replay_log(
     the summary, and the session that it is of.
 
     Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped. Raises
-    LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why. ImportSourceError: the
-    corrections cannot be read.
+    LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why. EmptyMapError: no
+    frame was, with the results written all the same. ImportSourceError: the corrections cannot be read.
 
     ``log`` may be a folder with the parts of a recording, or these parts; ``max_frames`` 0 means all. A Rerun recording
     goes to ``rerun``, or to what ``watch`` makes of the pipeline. ``corrections`` is a trajectory file that the map is
@@ -116,7 +116,7 @@ def replay_log(
     if not session.fused:
         empty = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
         reason = f"the first: {session.refusals.first[0].reason}" if session.refusals else empty
-        raise LogError(f"{source.path}: none of {counted(session.published, 'frame')} could be mapped; {reason}")
+        raise EmptyMapError(f"{source.path}: none of {counted(session.published, 'frame')} could be mapped; {reason}")
     return summary, session
 
 

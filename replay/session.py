@@ -23,6 +23,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.odometry_sessions import OdometrySessions, Taken
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.types import MapUpdate, PosedFrame
 
@@ -32,7 +33,11 @@ if TYPE_CHECKING:
 
 _log = get_logger(__name__)
 
-MOSTLY = 0.5  # of a frame that weights of its scene know; of the frames that they do not, for a warning
+# Of a frame that weights of its scene know; of a frame's depth that is too far; of the frames that this is so of, for a
+# warning
+MOSTLY = 0.5
+FAR_LIMIT = 0.85  # of ``depth.from_motion.far_m``: computed depth from here on fits the farthest plane best
+EVERY = 4  # rows and columns of depth that are looked at
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
 SNAPSHOTS = 8  # frames kept for the overview picture
 BIN_GROWTH = 1.005  # each bin of a histogram of times is so much longer than the one before
@@ -129,6 +134,8 @@ class MapSession:
         self._known, self._mapped = 0.0, 0  # fractions of frames that they know, in sum; frames
         self.computed_depth = 0  # their geometry was computed from the pictures
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
+        self.with_depth = 0  # measured or computed at some pixel
+        self.too_far = 0  # most of it beyond ``_range_m``
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
         # which no frame can be made out:
         self.refusals, self.label_refusals = BoundedLog[Refusal](), BoundedLog[Refusal]()
@@ -198,6 +205,7 @@ class MapSession:
                 _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
             self.computed_depth += 1
             self.too_little_motion += not frame.depth_m.any()
+        self._note_range(frame)
         # How much weights of one scene know of it: weights of another scene cannot be recognised otherwise.
         known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
         self._known, self._mapped = self._known + known, self._mapped + 1
@@ -212,6 +220,41 @@ class MapSession:
         if self.rerun is not None:
             self.rerun.log_step(frame, update)
         return replace(update, world=frame.world, T_map_world=self.odometry_sessions.where(frame.world))
+
+    def _note_range(self, frame: PosedFrame) -> None:
+        if frame.depth_m is None or not len(known := (depth := frame.depth_m[::EVERY, ::EVERY])[depth > 0]):
+            return
+        self.with_depth += 1
+        self.too_far += float(np.mean(known > self._range_m)) > MOSTLY
+
+    @property
+    def range_warning(self) -> str:
+        """What is wrong with depth that is too far in most frames, and how to fix it; empty where it is not."""
+        if self.too_far <= MOSTLY * self.with_depth:
+            return ""
+        frames = f"in {self.too_far} of {counted(self.with_depth, 'frame')} most of the"
+        if self.computed_depth:
+            return (
+                f"{frames} computed depth is beyond {self._range_m:g} m, where the range (voxel_map.depth_max_m, "
+                "depth.from_motion.far_m) ends: the camera hardly moved sideways (walk past things while filming), the "
+                "poses have too large a scale (give the right one at the import), or the scene is large (raise both)"
+            )
+        return (
+            f"{frames} depth is beyond the range of the map (voxel_map.depth_max_m = {self._range_m:g} m) and not "
+            "mapped: check the unit of depth (depth_scale), or raise the range"
+        )
+
+    @property
+    def _range_m(self) -> float:
+        """Depth beyond is not mapped, or is at the limit of what can be computed."""
+        config = self.pipeline.config
+        computed = FAR_LIMIT * config.depth.from_motion.far_m if self.computed_depth else math.inf
+        return min(computed, config.voxel_map.depth_max_m)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with most frames: depth out of range."""
+        return (self.range_warning,)
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""

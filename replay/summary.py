@@ -105,7 +105,9 @@ def result_lines(out: Path) -> list[str]:
 
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
-    frames, warnings = summary["frames"], (dig(summary, "map.nearly_empty"), dig(summary, "pose_check.warning"))
+    frames, warnings = summary["frames"], [dig(summary, place) for place in _WARNINGS]
+    if warnings[0]:  # which says it, too, where depth out of range is why
+        warnings.remove(dig(summary, "depth.range_warning"))
     lines = [f"warning: {warning}" for warning in (*warnings, *(dig(summary, "pictures.notes") or ())) if warning]
     for path, text in _DEPTH_NOTES.items():
         if fraction := dig(summary, path):
@@ -132,6 +134,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+_WARNINGS = ("map.nearly_empty", "pose_check.warning", "depth.range_warning")
 _RESULTS = {
     "overview.png": "picture",
     "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",

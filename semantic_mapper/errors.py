@@ -39,6 +39,10 @@ class LogError(SemanticMapperError):
     """A recorded log cannot be opened or read."""
 
 
+class EmptyMapError(LogError):
+    """No frame of a recording could be mapped."""
+
+
 class ImportSourceError(SemanticMapperError):
     """A foreign recording cannot be imported."""
 

@@ -12,6 +12,7 @@ import typer
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.importing import SourceOptions, import_source
 from semantic_mapper.nodes.cli.verb import (
+    EXIT_EMPTY,
     EXIT_UNTRUSTED,
     JsonOutput,
     MapperSettings,
@@ -52,7 +53,7 @@ def map_(
     rerun: Path | None = None,  # also write a Rerun recording (.rrd)
     # corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end
     corrections: Path | None = None,
-    accept_contradictions: bool = False,  # exit code 0 in place of 3
+    accept_untrusted: bool = False,  # exit code 0 in place of 3
     open_: bool = False,  # show the report in a browser at the end
     view: bool = False,  # show frames and map in a browser meanwhile, and then until Ctrl-C
 ) -> int:
@@ -63,7 +64,8 @@ def map_(
 
     Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
-    Where poses and depth contradict each other, the map is written and the exit code is 3.
+    Exit code 3: the map is written, but cannot be trusted; poses and depth contradict each other, or computed depth
+    is mostly at the end of its range. Exit code 4: the map is empty, or nearly so; what is said tells why.
 
     Example: semantic-mapper map path/to/redkitchen --open
     Example: semantic-mapper map kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
@@ -102,9 +104,10 @@ def map_(
             open_browser((out / "report.html").resolve().as_uri())
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
-        untrusted = dig(summary, "pose_check.warning") and not accept_contradictions
-        empty = not dig(summary, "map.surface_points")
-        code = stop.exit_code or (EXIT_UNTRUSTED if untrusted or empty else 0)
+        empty = dig(summary, "map.nearly_empty") or not dig(summary, "map.surface_points")
+        untrusted = dig(summary, "pose_check.warning") or dig(summary, "depth.computed_too_far")
+        code = EXIT_EMPTY if empty else EXIT_UNTRUSTED if untrusted and not accept_untrusted else 0
+        code = stop.exit_code or code
         if page is not None and not stop:
             stderr_console().print("the page stays until Ctrl-C")
             page.wait(stop)

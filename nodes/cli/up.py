@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from semantic_mapper.errors import LogError
+from semantic_mapper.errors import EmptyMapError
 from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb
 from semantic_mapper.nodes.console import Output
@@ -32,7 +32,8 @@ def up(
     Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
     a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
     where the launch file says so it is restarted first (`restart`). The exit code is 1, too, where a recorder knows at
-    its end that frames are not in its log. `semantic-mapper view --status` shows how the nodes are.
+    its end that frames are not in its log, and 4 where a mapper mapped no frame. `semantic-mapper view --status` shows
+    how the nodes are.
 
     Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
     Example: semantic-mapper up camera --set camera.kind=oak
@@ -56,7 +57,7 @@ def run_launch(output: Output, launch: Launch, on_ready: Callable[[Path], None] 
             why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"]
             why += [summary["map"]["nearly_empty"] or "no frames came"]
             count = summary["frames"]["published"]
-            raise LogError(f"{name}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
+            raise EmptyMapError(f"{name}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
 
 
 def _written(folder: Path) -> int:

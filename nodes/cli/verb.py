@@ -3,8 +3,9 @@
 The parameters of a verb's function are what it takes: those before ``*`` are arguments, those behind it options. What
 the help says of one is the comment at it, its bounds are those of its type (``msgspec.Meta``), as of any setting.
 
-0 done; 1 failed; 2 wrong usage; 3 a map that cannot be trusted; 130 after Ctrl-C, 143 after SIGTERM (what was done so
-far is written where a verb says so); 1 too where a result is negative (``doctor`` finds something missing).
+0 done; 1 failed; 2 wrong usage; 3 a map that cannot be trusted; 4 an empty map; 130 after Ctrl-C, 143 after SIGTERM
+(what was done so far is written where a verb says so); 1 too where a result is negative (``doctor`` finds something
+missing).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from semantic_mapper.config import (
     parse_assignments,
     read_toml,
 )
-from semantic_mapper.errors import LogError, SemanticMapperError
+from semantic_mapper.errors import EmptyMapError, LogError, SemanticMapperError
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
@@ -43,7 +44,10 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
-EXIT_UNTRUSTED = 3  # poses and depth of a recording contradict each other, so that its map cannot be trusted
+EXIT_UNTRUSTED = (
+    3  # poses and depth of a recording contradict each other, or most computed depth is at the end of its range
+)
+EXIT_EMPTY = 4  # a map has no surface, or next to none
 EXIT_INTERRUPTED = 130
 LISTED = 10  # lines of one kind that are shown one by one
 
@@ -214,7 +218,7 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
             if Settings.verbose:
                 _log.exception("failed", error=str(error))
             show_error(str(error))
-            code = EXIT_FAILED
+            code = EXIT_EMPTY if isinstance(error, EmptyMapError) else EXIT_FAILED
         except KeyboardInterrupt:
             show_error("interrupted")
             code = EXIT_INTERRUPTED

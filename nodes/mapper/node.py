@@ -266,7 +266,7 @@ class MapperNode(Closing):
                 "relocalized": sessions.found,
                 "not_found": sessions.refused.total(),
             }
-            warnings.append(sessions.warning)
+            warnings += [sessions.warning, *session.warnings]
         if not pipeline.voxel_map.scale_known:
             warnings.append(f"scale: unknown; lengths of the map are not metres: {SCALE_FIX}")
         counters |= pipeline.picture_check.counters

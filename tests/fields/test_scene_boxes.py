@@ -44,11 +44,8 @@ def test_what_is_in_front_dims_what_is_behind(x: float, of_scene: float, of_box:
 
 
 @pytest.mark.parametrize("stamp_ns", [None, 8, 16])
-def test_a_box_that_is_elsewhere_or_nowhere_changes_nothing(stamp_ns: int | None) -> None:
+def test_a_box_that_is_elsewhere_or_nowhere_changes_nothing_and_an_unfilled_one_is_empty(stamp_ns: int | None) -> None:
     before = scene(stamp_ns)
     assert box(4.0).composite(before, 8) is before
-
-
-def test_a_box_that_nobody_has_filled_is_empty() -> None:
     found = MovingBoxes(box(1.0).primitives, 0.2).composite(scene(0), 8)
     assert found.light.tolist() == found.weight.sum(1).tolist() == [0.5, 0.5]

@@ -20,30 +20,8 @@ from tests.nodes.support import (
     run_ok,
     summary_of,
     write_log,
-    write_weights,
 )
 from tests.small import tiny_frames
-
-
-def test_replay_writes_map_picture_and_summary(replayed: Path) -> None:
-    summary = summary_of(replayed)
-    assert summary["frames"]["published"] == summary["frames"]["fused"] == 6
-    assert summary["frames"]["dropped"] == 0 and summary["stopped_by"] is None
-    assert summary["map"]["voxel_size_m"] == 0.05 and summary["map"]["surface_points"] > 0
-    for name in ("map.ply", "map.npz", "overview.png"):
-        assert (replayed / name).stat().st_size > 0
-    assert json.loads((replayed / "stdout.txt").read_text()) == summary, "JSON stands alone on stdout"
-
-
-def test_unknown_settings_and_bad_corrections_are_named(log: Path, tmp_path: Path) -> None:
-    wrong, corrections = tmp_path / "wrong.toml", tmp_path / "corrections.txt"
-    wrong.write_text("[voxel_map]\nvoxel_sise_m = 0.05\n")
-    corrections.write_text("no trajectory\n")
-    for option, file, said in (
-        ("--config", wrong, "did you mean `voxel_size_m`?"),
-        ("--corrections", corrections, "corrections.txt: holds no pose"),
-    ):
-        assert said in refused("map", log, "--out", tmp_path / "out", option, file)
 
 
 def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
@@ -82,22 +60,6 @@ def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights:
     assert (out / "map.ply").exists()
 
 
-def test_frames_that_weights_were_finetuned_on_are_never_scored(log: Path, config: Path, tmp_path: Path) -> None:
-    tuned = write_weights(tmp_path / "tuned.safetensors", [f.stamp_ns for f in tiny_frames(6)[:2]])
-    options = ("--weights", tuned, "--config", config, "--max-frames", "3")
-    done = run_ok("map", log, "--out", tmp_path / "out", *options)
-    frames = summary_of(tmp_path / "out")["frames"]
-    assert (frames["fused"], frames["scored"], frames["excluded_from_scores"]) == (3, 1, 2)
-    assert "2 frames left out of the scores" in done.stdout
-
-
-def test_corrections_move_the_map_at_the_end(log: Path, weights: Path, tmp_path: Path) -> None:
-    file, out = tmp_path / "corrected.txt", tmp_path / "out"
-    file.write_text("".join(f"{f.stamp_ns / 1e9:.9f} 1 2 3 0 0 0 1\n" for f in tiny_frames()[:2]))
-    run_ok("map", log, "--out", out, "--weights", weights, "--corrections", file)
-    assert summary_of(out)["map"]["corrected_poses"] == 2
-
-
 @pytest.mark.slow
 def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path) -> None:
     """Poses of a body with x forward, published as the camera's."""
@@ -107,8 +69,18 @@ def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path
     write_log(tmp_path / "log.mcap", frames)
     command = ("map", tmp_path / "log.mcap", "--out", tmp_path / "run", "--quality", "fast")
     assert run(*command).returncode == 3
-    run_ok(*command, "--accept-contradictions")
+    run_ok(*command, "--accept-untrusted")
     assert "x forward" in summary_of(tmp_path / "run")["pose_check"]["warning"]
+
+
+def test_an_empty_map_has_an_exit_code_of_its_own(tmp_path: Path, weights: Path, config: Path) -> None:
+    far = [replace(f, depth_m=None if f.depth_m is None else 10 * f.depth_m) for f in tiny_frames(3)]
+    log, out = write_log(tmp_path / "far.mcap", far), tmp_path / "out"
+    said = refused("map", log, "--out", out, "--weights", weights, "--config", config, code=4)
+    assert "none of 3 frames could be mapped" in said and "beyond the range of the map" in said
+    summary = summary_of(out)
+    assert "depth_scale" in summary["depth"]["range_warning"] and not summary["map"]["surface_points"]
+    assert {"overview.png", "map.npz", "report.html"} <= {path.name for path in out.iterdir()}
 
 
 @pytest.mark.slow  # 24 frames
