@@ -128,6 +128,8 @@ def _subtitles(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]
         yield "MAP NEARLY EMPTY (see summary.json)"
     if summary["depth"]["range_warning"]:
         yield "DEPTH OUT OF RANGE (see summary.json)"
+    if summary["pictures"]["unlike_training_warning"]:
+        yield "PICTURES UNLIKE THOSE OF THE TRAINING: CLASSES CANNOT BE TRUSTED"
     if (miou := summary["metrics"]["miou"]) is not None:
         yield f"mIoU {percent(miou)} over {session.scored} labelled frames that the weights have not seen"
     else:
@@ -181,6 +183,7 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
     """The summary as plain data."""
     pipeline, mapper = session.pipeline, session.mapper
     voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
+    known = pipeline.domain_check
     refusals = sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)
     return {
         "source": session.source,
@@ -212,6 +215,8 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "checked": pipeline.picture_check.checked,
             **{name: pipeline.picture_check.counters[name] for name in SENTENCES},
             "notes": pipeline.picture_check.notes,
+            "unlike_training": None if not known or not known.pictures else round(known.unlike / known.pictures, 4),
+            "unlike_training_warning": (known.warning or None) if known else None,
         },
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,

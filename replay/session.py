@@ -253,8 +253,9 @@ class MapSession:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with most frames: depth out of range."""
-        return (self.range_warning,)
+        """What is wrong with most frames: depth out of range, pictures unlike those that the weights learned from."""
+        check = self.pipeline.domain_check
+        return self.range_warning, "" if check is None else check.warning
 
     def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""

@@ -134,7 +134,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-_WARNINGS = ("map.nearly_empty", "pose_check.warning", "depth.range_warning")
+_WARNINGS = ("map.nearly_empty", "pose_check.warning", "depth.range_warning", "pictures.unlike_training_warning")
 _RESULTS = {
     "overview.png": "picture",
     "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
@@ -208,6 +208,7 @@ _ROWS: Sequence[tuple[str, str, Callable[[Any], str]]] = (
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
     ("known to the weights", "scene", _scene_known),
+    ("pictures unlike training", "pictures.unlike_training", percent),
     ("unknown surface", "map.unknown", percent),
     ("computed surface", "map.computed", percent),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),

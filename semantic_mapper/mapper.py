@@ -9,6 +9,7 @@ from semantic_mapper.config import MapperConfig, convert_config, load_config, to
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, find_checkpoint, load_checkpoint
 from semantic_mapper.fields.device import DeviceField, choose_device
+from semantic_mapper.fields.domain_check import find_domain_check
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
@@ -48,6 +49,8 @@ class Mapper:
             config = convert_config(plain, MapperConfig, "mapper config")
         field = make_field(checkpoint.model, config)
         pipeline = MappingPipeline(config, field, checkpoint.label_set, anchors=checkpoint.anchors)
+        network = field.model if isinstance(field, DeviceField) else checkpoint.model
+        pipeline.domain_check = find_domain_check(checkpoint, network)
         return cls(pipeline, checkpoint, path)
 
     @property

@@ -16,6 +16,7 @@ import torch
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
+from semantic_mapper.fields.domain_check import DomainCheck
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import (
@@ -69,7 +70,8 @@ class MappingPipeline:
     Deterministic: same frames, config, field and thread count give the same map, bit for bit. ``anchors`` are labelled
     keyframes that the field was finetuned on: source views from the first frame on. ``corrector`` moves the map with
     corrected poses, ``frame_depth`` gives frames their depth, ``picture_check`` says what was wrong with pictures,
-    ``pose_in_map`` where the last frame was. ``WeightsError``: the field renders other classes than the map holds."""
+    ``domain_check`` whether the weights know such pictures, ``pose_in_map`` where the last frame was.
+    ``WeightsError``: the field renders other classes than the map holds."""
 
     def __init__(
         self, config: MapperConfig, field: SemanticField, label_set: LabelSet, *, anchors: Sequence[PosedFrame] = ()
@@ -82,6 +84,7 @@ class MappingPipeline:
         self.keyframes = KeyframeStore(config.keyframes)
         self.frame_depth = FrameDepth(config.depth, self._cast_for_hint)
         self.picture_check = self.frame_depth.pictures
+        self.domain_check: DomainCheck | None = None  # where it is known what the weights learned from
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self.moving = MovingFilter(config, label_set)
         self.pose_in_map = PoseInMap()
@@ -107,6 +110,8 @@ class MappingPipeline:
             views = FrameViews(self._checked(self.corrector.place(frame)))
             self._stage_ms = {}
             current = self._timed("encode", self._encode, views)
+            if self.domain_check is not None:
+                self.domain_check.note()
             sources = self._timed("choose", self._choose_sources, views, current, self.keyframes)
             view, votes = self._timed("render", self._render_semantics, views, sources, current)
             moving = self._timed("motion", self.moving.find, views.frame)
@@ -157,6 +162,7 @@ class MappingPipeline:
         of those before; what is in the map stays. ``WeightsError``: it renders other classes; nothing has changed."""
         check_classes(field, self.label_set)
         self.field = self._renderer.field = field
+        self.domain_check = None  # they were fitted to this place
         self.keyframes.exchange_labelled(anchors)
 
     def agreement(self, frame: PosedFrame, renderer: ViewRenderer, keyframes: KeyframeStore) -> tuple[int, int]:

@@ -22,8 +22,5 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
     assert found["frames"] == 12 and found["memory_mb"] == 30
     assert found["step_p50_ms"] > 0
     assert plot.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_walk_that_is_none_is_refused_with_what_it_needs(weights: Path, config: Path) -> None:
     done = run("bench", "map", *SMALL, "--loops", "5", "--weights", weights, "--config", config)
-    assert done.returncode == 1 and "returns" in error_line(done.stderr)
+    assert done.returncode == 1 and "returns" in error_line(done.stderr), "a walk that is none"

@@ -27,9 +27,5 @@ def test_each_method_has_a_column_and_a_missing_one_stays_empty() -> None:
     assert shows(sheet, ROOMS.colors[ROOMS.names.index("bed")]) * sheet[..., 0].size >= 3 * tile
     assert shows(sheet, ROOMS.colors[ROOMS.names.index("wall")]) * sheet[..., 0].size >= 2 * tile
     assert shows(sheet, UNKNOWN) * sheet[..., 0].size < 200
-
-
-def test_unknown_is_grey_and_in_the_legend() -> None:
-    unknown = np.full((24, 32), ROOMS.ignore_id, np.uint8)
-    sheet = draw_sheet([row(a=unknown)], ["a"], ROOMS, title="sheet")
-    assert shows(sheet, UNKNOWN) * sheet[..., 0].size > 320 * 240
+    unknown = draw_sheet([row(a=np.full((24, 32), ROOMS.ignore_id, np.uint8))], ["a"], ROOMS, title="sheet")
+    assert shows(unknown, UNKNOWN) * unknown[..., 0].size > 320 * 240
