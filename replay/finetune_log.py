@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from semantic_mapper.config import DepthConfig, PanopticConfig
+from semantic_mapper.config import DepthConfig, MapperConfig, PanopticConfig, VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import (
     Checkpoint,
@@ -416,7 +416,7 @@ def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
         numbers = frozenset(n for n, (envelope, _) in enumerate(log.frame_parts()) if envelope.has_label)
         if numbers:
             return PseudoLabels(log.info.label_set, "the log's own label images", numbers)
-    mapper = Mapper.load(pseudo)
+    mapper = Mapper.load(pseudo, MapperConfig(voxel_map=VoxelMapConfig(unknown_below=0.0)))  # teach every class
     mapper.voxel_map.note_scale(log.info.scale_known)
     source = f"the map that {mapper.weights_path.name} makes of the frames"
     return PseudoLabels(mapper.label_set, source, mapper=mapper)

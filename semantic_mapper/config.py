@@ -196,7 +196,9 @@ class VoxelMapConfig(Config, frozen=True):
     depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
-    unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
+    # Labels of less confidence read as unknown, 0 = none do. Confidence is calibrated: below 0.5 a label is more likely
+    # wrong than right
+    unknown_below: Fraction = 0.5
     clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``mapping/clearing.py``)
 
     # The same for all maps:

@@ -43,6 +43,7 @@ def tiny_frames(count: int = 6, seed: int = 7) -> tuple[PosedFrame, ...]:
 
 
 def tiny_config(**changes: object) -> MapperConfig:
-    """A config for 96x72 frames; ``changes`` are whole sections as dicts."""
-    base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": {"voxel_size_m": 0.05}}
+    """A config for 96x72 frames and untrained weights; ``changes`` are whole sections as dicts."""
+    voxel_map = {"voxel_size_m": 0.05, "unknown_below": 0.0}
+    base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": voxel_map}
     return convert_config({**base, **changes}, MapperConfig, "test config")

@@ -26,11 +26,11 @@ FRAMES = 11  # of the log
 REFUSED_SEQ = 5  # the one whose pose is no rotation
 # Half of the frames' size is that of the feature maps, so that rays meet the middles of their pixels. At a quarter they
 # would meet the very borders between two, and rounding would say which of the two the current view looks up.
-ROOM_SETTINGS = "[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.05\n"
+ROOM_SETTINGS = "[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.05\nunknown_below = 0.0\n"
 STORED_SETTINGS = {  # of a time when frames told the map what was rendered, and nothing else
     "render": {"scale": 0.5},
     "keyframes": {"own_image_weight": 0.0},
-    "voxel_map": {"voxel_size_m": 0.12},
+    "voxel_map": {"voxel_size_m": 0.12, "unknown_below": 0.0},
 }
 STORED_FRAMES = 3
 SMALL_ARRAY = 16  # numbers that are written down one by one; of larger arrays the digest

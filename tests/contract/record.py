@@ -120,7 +120,7 @@ def make_files(folder: Path) -> None:
         made.store(STORED)
     if not MAP_COARSE.exists():
         config = folder / "coarse.toml"
-        config.write_text("[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\n")
+        config.write_text("[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\nunknown_below = 0.0\n")
         out = folder / "coarse"
         ran = api.run_here("map", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
         assert ran.code == 0, ran.stderr

@@ -15,7 +15,7 @@ LABELS = make_label_set("three", ("table", "cup", "wall"), ids=(5, 9, 2), ignore
 
 
 def small_map(labels: LabelSet = LABELS, **changes: float) -> VoxelMap:
-    return VoxelMap(VoxelMapConfig(**changes), labels)  # type: ignore[arg-type]
+    return VoxelMap(VoxelMapConfig(**{"unknown_below": 0.0, **changes}), labels)  # type: ignore[arg-type]
 
 
 def ray_directions(intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Float64:

@@ -23,7 +23,7 @@ UP = np.array((0.0, 0.0, 1.0))
 
 def make_map(label_set: LabelSet = ROOMS, votes: bool = True, **changes: object) -> VoxelMap:
     """A small room; each second row of pixels votes, with chance probabilities of the true class."""
-    config = replace(VoxelMapConfig(voxel_size_m=0.04), **changes)
+    config = replace(VoxelMapConfig(voxel_size_m=0.04, unknown_below=0.0), **changes)
     voxel_map = VoxelMap(config, label_set)
     rng = np.random.default_rng(0)
     for frame in tiny_frames():

@@ -54,6 +54,7 @@ source_views = 3
 guided = 4
 [voxel_map]
 voxel_size_m = 0.05
+unknown_below = 0.0
 """
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import transform, unproject
@@ -132,7 +133,7 @@ def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weig
     with open_log(log) as opened:
         labels = open_pseudo_labels(opened, str(weights))
         taught = FrameSource(opened, None, request, JobMonitor(), {}).pseudo_labelled(labels)
-        mapper = Mapper.load(weights)
+        mapper = Mapper.load(weights, MapperConfig(voxel_map=VoxelMapConfig(unknown_below=0.0)))
         own = [mapper.step(replace(frame, label=None)).label for frame in opened]
     nothing, mapped, changed = mapper.label_set.ignore_id, 0, 0
     for frame, label in zip(taught, own, strict=True):
