@@ -183,7 +183,7 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
     """The summary as plain data."""
     pipeline, mapper = session.pipeline, session.mapper
     voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
-    known = pipeline.domain_check
+    domain = pipeline.domain_check
     refusals = sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)
     return {
         "source": session.source,
@@ -215,8 +215,8 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "checked": pipeline.picture_check.checked,
             **{name: pipeline.picture_check.counters[name] for name in SENTENCES},
             "notes": pipeline.picture_check.notes,
-            "unlike_training": None if not known or not known.pictures else round(known.unlike / known.pictures, 4),
-            "unlike_training_warning": (known.warning or None) if known else None,
+            "unlike_training": round(domain.unlike / domain.pictures, 4) if domain and domain.pictures else None,
+            "unlike_training_warning": (domain.warning or None) if domain else None,
         },
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,

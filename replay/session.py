@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 _log = get_logger(__name__)
 
-# Of a frame that weights of its scene know; of a frame's depth that is too far; of the frames that this is so of, for a
-# warning
-MOSTLY = 0.5
+MOSTLY = 0.5  # of a frame that its weights know, or whose depth is too far; of the frames, for a warning
 FAR_LIMIT = 0.85  # of ``depth.from_motion.far_m``: computed depth from here on fits the farthest plane best
 EVERY = 4  # rows and columns of depth that are looked at
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary

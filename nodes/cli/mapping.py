@@ -106,8 +106,8 @@ def map_(
             stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
         empty = dig(summary, "map.nearly_empty") or not dig(summary, "map.surface_points")
         untrusted = dig(summary, "pose_check.warning") or dig(summary, "depth.computed_too_far")
-        code = EXIT_EMPTY if empty else EXIT_UNTRUSTED if untrusted and not accept_untrusted else 0
-        code = stop.exit_code or code
+        untrusted = untrusted and not accept_untrusted
+        code = stop.exit_code or (EXIT_EMPTY if empty else EXIT_UNTRUSTED if untrusted else 0)
         if page is not None and not stop:
             stderr_console().print("the page stays until Ctrl-C")
             page.wait(stop)
