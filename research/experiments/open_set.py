@@ -2,13 +2,13 @@
 
 python -m research.experiments.open_set statistics              # of training pictures, into the package
 python -m research.experiments.open_set pictures NAME=PATH ...  # a log, a folder of pictures or panoramas, or rooms
-python -m research.experiments.open_set coverage LOG ...        # thresholds of voxel_map.unknown_below
+python -m research.experiments.open_set coverage LOG            # thresholds of voxel_map.unknown_below
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -72,7 +72,7 @@ def _training_pictures() -> Iterator[UInt8]:
         yield from (frame.rgb for frame in frames)
 
 
-def _write_statistics() -> None:
+def _write_statistics(_: Sequence[str]) -> None:
     found = _features(_training_pictures())
     spread = np.cov(found.T)
     spread += SHRINKAGE * np.trace(spread) / len(spread) * np.eye(len(spread))
@@ -108,26 +108,25 @@ def _look_into(panorama: UInt8, turn_deg: float) -> UInt8:
     rays = rays @ np.array(((1, 0, 0), (0, c, -s), (0, s, c))).T / np.linalg.norm(rays, axis=-1, keepdims=True)
     x = (np.arctan2(rays[..., 0], rays[..., 2]) / (2 * np.pi) + turn_deg / 360 + 0.5) % 1 * width - 0.5
     y = (np.arcsin(rays[..., 1]) / np.pi + 0.5) * height - 0.5
-    maps = x.astype(np.float32), y.astype(np.float32)
-    return np.asarray(cv2.remap(panorama, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.uint8)
+    seen = cv2.remap(panorama, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(seen, np.uint8)
 
 
-def _show_pictures(sources: Iterable[str]) -> None:
+def _show_pictures(sources: Sequence[str]) -> None:
     check = Mapper.load().pipeline.domain_check
     assert check is not None, "run `statistics` first"
     print("| pictures | count | distance: 5 % | median | 95 % | unlike |\n|---|---|---|---|---|---|")
     for name, _, path in (source.partition("=") for source in sources):
         found = [check.distance(torch.from_numpy(f).float()) for f in _features(_pictures_at(path))]
-        low, middle, high = np.percentile(found, (5, 50, 95))
-        unlike = np.mean(np.array(found) > UNLIKE)
+        low, middle, high, unlike = *np.percentile(found, (5, 50, 95)), np.mean(np.greater(found, UNLIKE))
         print(f"| {name} | {len(found)} | {low:.2f} | {middle:.2f} | {high:.2f} | {unlike:.0%} |")
 
 
-def _show_coverage(path: Path) -> None:
-    config = MapperConfig(voxel_map=VoxelMapConfig(unknown_below=0.0))
+def _show_coverage(sources: Sequence[str]) -> None:
+    path = Path(sources[0])
     with open_log(path) as log:
         assert log.info.label_set is not None, "a log without labels"
-        mapper = Mapper.load(None, config)
+        mapper = Mapper.load(None, MapperConfig(voxel_map=VoxelMapConfig(unknown_below=0.0)))
         surface, target = SurfaceTruth(log.info.label_set), TruthMapper(log.info.label_set, mapper.label_set)
         for frame in log:
             mapper.step(frame)
@@ -155,12 +154,7 @@ def main() -> None:
     parser.add_argument("what", choices=("statistics", "pictures", "coverage"))
     parser.add_argument("sources", nargs="*")
     given = parser.parse_args()
-    if given.what == "statistics":
-        _write_statistics()
-    elif given.what == "pictures":
-        _show_pictures(given.sources)
-    for source in given.sources if given.what == "coverage" else ():
-        _show_coverage(Path(source))
+    {"statistics": _write_statistics, "pictures": _show_pictures, "coverage": _show_coverage}[given.what](given.sources)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from semantic_mapper.config import (
     NotNegative,
     Positive,
     SamplingConfig,
+    VoxelMapConfig,
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
@@ -130,7 +131,8 @@ class SuiteConfig(Config, frozen=True):
     sequence: SequenceConfig = SequenceConfig()
     scene: SceneBudget = SceneBudget()
     map_frames: AtLeastOne = 40  # of a room that are mapped for the map-level figures
-    mapper: MapperConfig = MapperConfig()  # that they are mapped with
+    # That they are mapped with: every point has its class, so that figures compare
+    mapper: MapperConfig = MapperConfig(voxel_map=VoxelMapConfig(unknown_below=0.0))
     seed: NotNegative = 0
 
 

@@ -31,7 +31,7 @@ guard = 1
 shares = [1.0]
 [mapper]
 render = { encode_width = 48, scale = 0.125 }
-voxel_map = { voxel_size_m = 0.05 }
+voxel_map = { voxel_size_m = 0.05, unknown_below = 0.0 }
 """
 
 

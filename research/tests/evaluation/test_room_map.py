@@ -14,7 +14,7 @@ from research.tests.suites.tiny import ROOM, tiny_room, tiny_suite
 from semantic_mapper.labels import ROOMS, make_label_set
 from tests.nodes.support import write_weights
 
-MAPPER = {"render": {"encode_width": 48, "scale": 0.125}, "voxel_map": {"voxel_size_m": 0.05}}
+MAPPER = {"render": {"encode_width": 48, "scale": 0.125}, "voxel_map": {"voxel_size_m": 0.05, "unknown_below": 0.0}}
 
 
 def test_true_surface_lies_on_the_floor_where_it_says_floor() -> None:
