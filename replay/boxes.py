@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 from xml.etree import ElementTree
@@ -38,7 +39,7 @@ from semantic_mapper.types import Float64
 MAX_FILE_BYTES = 1 << 28  # 50,000 boxes of KITTI-360 take 0.1 GB
 MAX_ID = 65535  # what an instance image of 16 bits holds; 0 is background
 MIN_SIZE_M = 0.001
-QUERY_MARGIN_M = 0.05  # boxes of `query` end in the middle of surface voxels; this far beyond is theirs, too
+QUERY_MARGIN_M = 0.05  # boxes of `query` end in the middle of surface voxels; for a fit, this far beyond is theirs, too
 MAX_NAMED = 10  # boxes that cannot be used, in an error
 # A box is one thing unless its class is one of these. As KITTI-360 has it, a building is a thing, too.
 BOX_STUFF = STUFF_NAMES - {"building"} | {"rail track", "guard rail", "tunnel", "gate", "polegroup"}
@@ -108,8 +109,8 @@ class _Instance(msgspec.Struct, frozen=True, rename={"class_name": "class"}):
     box: _QueryBox
 
 
-def load_boxes(path: Path) -> BoxFile:
-    """Read a file of boxes in any of the three formats.
+def load_boxes(path: Path, *, query_margin_m: float = 0.0) -> BoxFile:
+    """Read a file of boxes in any of the three formats; those of ``query`` grow by a margin on each side.
 
     Raises ConfigError: no such file, neither format, or boxes that cannot be used, each with its number in the file. Of
     XML these are left out, and counted in a warning, unless all are.
@@ -118,7 +119,7 @@ def load_boxes(path: Path) -> BoxFile:
         text = read_regular(path, MAX_FILE_BYTES).removeprefix(codecs.BOM_UTF8)
     except OSError as error:
         raise ConfigError(f"cannot read boxes from {path}: {error}") from error
-    found = _read_xml(text, path) if text.lstrip().startswith(b"<") else _read_json(text, path)
+    found = _read_xml(text, path) if text.lstrip().startswith(b"<") else _read_json(text, path, query_margin_m)
     if not found.bad:
         return found
     named = "; ".join(found.bad[:MAX_NAMED])
@@ -278,7 +279,7 @@ def _poses(known: list[tuple[int, Pose]] | None, name: str) -> tuple[tuple[int, 
     return tuple(sorted(poses.items()))
 
 
-def _read_json(text: bytes, path: Path) -> BoxFile:
+def _read_json(text: bytes, path: Path, query_margin_m: float) -> BoxFile:
     try:
         data: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -291,16 +292,17 @@ def _read_json(text: bytes, path: Path) -> BoxFile:
     elif not get_close_matches("boxes", table, n=1):
         raise ConfigError(f"{path} holds no boxes: {_FORMATS}")
     file = convert_config(table, _File, str(path))
-    good, bad = _parse_all(enumerate(file.boxes, 1), _from_query if of_query else lambda entry: entry)
+    read = partial(_from_query, margin_m=query_margin_m) if of_query else lambda entry: entry
+    good, bad = _parse_all(enumerate(file.boxes, 1), read)
     return BoxFile(good, file.merge, bad=bad)
 
 
-def _from_query(entry: Any) -> dict[str, Any]:
+def _from_query(entry: Any, margin_m: float) -> dict[str, Any]:
     """One instance of `query MAP instances`."""
     thing = convert_config(entry, _Instance, "an instance, as `query MAP instances` writes it")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.array(thing.box.R_world_box), thing.box.center
-    size = [metres + 2 * QUERY_MARGIN_M for metres in thing.box.size]
+    size = [max(metres + 2 * margin_m, MIN_SIZE_M) for metres in thing.box.size]
     return {"id": thing.id, "class": thing.class_name, "T_world_box": pose.tolist(), "size": size}
 
 

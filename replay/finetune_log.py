@@ -35,7 +35,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import FrameDepth
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.boxes import load_boxes, with_classes, with_times
+from semantic_mapper.replay.boxes import QUERY_MARGIN_M, load_boxes, with_classes, with_times
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -137,7 +137,7 @@ def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Che
 def _finetune_boxes(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Checkpoint, list[int]]:
     """A field of kind "panoptic"."""
     assert request.boxes is not None
-    boxes = load_boxes(request.boxes)
+    boxes = load_boxes(request.boxes, query_margin_m=QUERY_MARGIN_M)
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
         boxes, label_set = with_classes(boxes, labels.label_set, request.boxes, labels.source)
