@@ -77,7 +77,7 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
 
     Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """
-    there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
+    there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.certainty)
     gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)
     found: dict[str, Any] = {"question": "instances", "up": list(up)}
     found["instances"] = [_describe_thing(thing) for thing in there]
@@ -117,6 +117,8 @@ def _describe_thing(thing: Instance) -> dict[str, Any]:
     return {
         "id": thing.id,
         "class": thing.class_name,
+        "certainty": round(thing.certainty, DIGITS),
+        "seen": round(thing.seen, DIGITS),
         "confidence": round(thing.confidence, DIGITS),
         "voxels": len(thing.voxels),
         "measured": round(thing.measured, DIGITS),

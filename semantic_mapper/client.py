@@ -74,10 +74,14 @@ class MapClient(Closing):
         """What is at points (N, 3), world metres; see ``queries.nearest.at``."""
         return self._ask(questions.AtRequest(points=as_numbers(points, "points"), radius_m=radius_m))
 
-    def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
+    def nearest(
+        self, class_name: str, point: ArrayLike, min_confidence: float = 0.0, *, unsure: bool = False
+    ) -> NearestSurface | None:
         """The nearest surface of a class; see ``queries.nearest.nearest``."""
         return self._ask(
-            questions.NearestRequest(class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence)
+            questions.NearestRequest(
+                class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence, unsure=unsure
+            )
         )
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
@@ -94,13 +98,13 @@ class MapClient(Closing):
         """Surface points in a box; see ``queries.surface.points_in_box``."""
         return self._ask(questions.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper")))
 
-    def instances(self, up: ArrayLike = UP, *, gone: bool = False) -> tuple[Instance, ...]:
-        """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
+    def instances(self, up: ArrayLike = UP, *, gone: bool = False, unsure: bool = False) -> tuple[Instance, ...]:
+        """Things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
 
-        With ``gone``, behind them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest
-        64.
+        With ``unsure``, also those that are more likely stray pieces. With ``gone``, behind
+        them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest 64.
         """
-        return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone))
+        return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone, unsure=unsure))
 
     def graph(self, up: ArrayLike | None = None) -> SceneGraph:
         """Floors, rooms, doors and things; see ``queries.graph.GraphTracker``.

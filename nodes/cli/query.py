@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -62,6 +63,7 @@ def query(
     up: Up | None = None,  # instances, graph: in place of away from the floor
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least
     gone: bool = False,  # instances, running mapper: gone ones, too
+    unsure: bool = False,  # nearest, instances: pieces that are less likely things, too
     picture: Path | None = None,  # graph: also draw it from above (.png)
     camera: str = "",  # correct: the camera of the poses, of several
     every: AtLeastOne = 1,  # relocalize: every n-th frame
@@ -70,8 +72,8 @@ def query(
     """Ask a saved map, or that of a running mapper, what is where.
 
     info: size and classes. at X Y Z: class of the surface at a point, and whether it is free, occupied or unknown.
-    nearest CLASS X Y Z: the nearest surface of a class. instances: countable things with upright boxes. graph: floors,
-    rooms, doors, and things by room.
+    nearest CLASS X Y Z: the nearest surface of a class. instances: countable things with upright boxes, how certain
+    each is (certainty) and how much of its outside was seen. graph: floors, rooms, doors, and things by room.
 
     correct FILE moves the map of a running mapper that keeps its frames (`history.max_frames`) to corrected poses (TUM:
     stamp tx ty tz qx qy qz qw); a pose goes to the frame nearest in time, within 5 ms. relocalize LOG finds the frames
@@ -89,6 +91,7 @@ def query(
         return _correct(output, source, endpoint, Path(name), camera, remote)
     refuse_options(
         (gone and not (endpoint and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
+        (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
         (picture is not None and question != "graph", "--picture", "goes with `graph`"),
     )
     written = [path for path in (results_file(out), picture) if path is not None]
@@ -102,7 +105,10 @@ def query(
     else:
         client = MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(open_saved(source))
         with client as world_map:
-            found = {"map": source, **answer(world_map, question, name, point, up, min_confidence, gone, picture)}
+            found = {
+                "map": source,
+                **answer(world_map, question, name, point, up, min_confidence, gone, unsure, picture),
+            }
         output.print(answer_table(found))
     if out is not None:
         write_json(out, found)
@@ -124,6 +130,7 @@ def answer(
     up: Up | None = None,
     min_confidence: float = 0.0,
     gone: bool = False,
+    unsure: bool = False,
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """The answer of a running mapper or of a saved map, as plain data; the arguments are those of ``query``."""
@@ -138,14 +145,14 @@ def answer(
             found = at(world_map, [point]) if is_saved else world_map.at([point])
             return map_answers.answer_at(labels, point, found)
         case "nearest":
-            what = (class_name, point, min_confidence)
-            hit = nearest(world_map, *what) if isinstance(world_map, MapSnapshot) else world_map.nearest(*what)
+            ask = partial(nearest, world_map) if isinstance(world_map, MapSnapshot) else world_map.nearest
+            hit = ask(class_name, point, min_confidence, unsure=unsure)
             return map_answers.answer_nearest(class_name, point, hit)
         case "instances":
             axis = up or (_up_in(world_map) if isinstance(world_map, MapSnapshot) else map_answers.UP)
             if isinstance(world_map, MapSnapshot):
-                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(world_map))
-            return map_answers.answer_instances(axis, world_map.instances(axis, gone=gone))
+                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(world_map, unsure=unsure))
+            return map_answers.answer_instances(axis, world_map.instances(axis, gone=gone, unsure=unsure))
         case _:  # the graph
             graph = GraphTracker(up).update(world_map) if isinstance(world_map, MapSnapshot) else world_map.graph(up)
             if picture is not None:
@@ -253,13 +260,13 @@ def _instance_table(found: dict[str, Any]) -> Table:
     things = [*found["instances"], *found.get("gone", ())]
     rows = [
         (
-            *(thing["id"], thing["class"], f"{thing['confidence']:.2f}", thing["voxels"]),
-            *(f"{thing['measured'] * 100:.0f} %", _joined(thing["centroid"]), _joined(thing["box"]["size"])),
+            *(thing["id"], thing["class"], *(f"{thing[key] * 100:.0f} %" for key in ("certainty", "seen", "measured"))),
+            *(_joined(thing["centroid"]), _joined(thing["box"]["size"])),
             f"{thing['gone_ns'] / 1e9:.2f}" if "gone_ns" in thing else "",
         )
         for thing in things
     ]
-    names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m", "gone at, s")
+    names = ("id", "class", "certainty", "seen", "measured", "centroid, m", "box, m", "gone at, s")
     return table(rows, names, title=found["map"])
 
 

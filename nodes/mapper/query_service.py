@@ -260,7 +260,8 @@ class QueryService(Closing):
             case questions.AtRequest():
                 return at(snapshot.with_moving(self._moving.points), request.points, request.radius_m)
             case questions.NearestRequest():
-                return nearest(snapshot, request.class_name, request.point, request.min_confidence)
+                what = request.class_name, request.point, request.min_confidence
+                return nearest(snapshot, *what, unsure=request.unsure)
             case questions.RaysRequest():
                 return cast_rays(snapshot, request.origins, request.directions, request.max_m)
             case questions.BoxRequest():
@@ -296,11 +297,12 @@ class QueryService(Closing):
         tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
         tracker = tracker or InstanceTracker(up=request.up)
         if version != snapshot.version:
-            things = tracker.update(snapshot)
+            things = tracker.update(snapshot, unsure=True)
         self._tracked[request.up] = tracker, snapshot.version, things
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        return (*things, *(tracker.gone if request.gone else ()))
+        found = (*things, *(tracker.gone if request.gone else ()))
+        return tuple(thing for thing in found if request.unsure or not thing.unsure)
 
 
 def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:

@@ -40,14 +40,14 @@ MAX_FRAMES = 100  # that are kept; beyond that every second one goes
 
 
 class ThingSurface:
-    """The N surface voxels of a map as it is now, ``xyz`` (N, 3) in world metres, its ``things`` as queries find them,
-    and the ``number`` (N,) of the thing of each voxel, -1 = none. MapError where lengths are not metres."""
+    """The N surface voxels of a map as it is now, ``xyz`` (N, 3) in world metres, its ``things``, unsure ones, too, and
+    the ``number`` (N,) of the thing of each voxel, -1 = none. MapError where lengths are not metres."""
 
     def __init__(self, voxel_map: VoxelMap, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         snapshot = MapMirror.of(voxel_map).snapshot()
         every = surface_voxels(snapshot)
         keys = (every.row.astype(np.int64) << 9) | every.voxel  # ascending
-        self.things = InstanceTracker(up=up).update(snapshot)
+        self.things = InstanceTracker(up=up).update(snapshot, unsure=True)
         self.number: NDArray[np.int64] = np.full(len(keys), -1, np.int64)
         for index, thing in enumerate(self.things):
             block = np.searchsorted(snapshot.packed, pack_keys(thing.voxels >> 3))

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from research.evaluation.instances import FoundInstances, match_instances
+from research.evaluation.instances import FoundInstances, InstanceMatches, match_instances
 from research.evaluation.points import nearest_labels, nearest_points
 from research.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from research.suites.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
@@ -35,6 +35,7 @@ from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.evaluate.things import ThingSurface
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
@@ -226,12 +227,20 @@ def _compare_panoptic(room: FusedRoom, voxel_map: VoxelMap, casts: list[MapView]
 
 
 def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRecord:
-    """The things that queries find in a map, against those of the true surface, at the map's surface voxels."""
+    """As ``match_things``, as data."""
+    _, matches = match_things(voxel_map, surface)
+    found = tuple((m.class_id, m.confidence, m.iou, m.truth, m.neither) for m in matches.found)
+    return InstanceRecord(found=found, truth=matches.truth)
+
+
+def match_things(voxel_map: VoxelMap, surface: TrueSurface) -> tuple[tuple[Instance, ...], InstanceMatches]:
+    """The things that queries find in a map, unsure ones, too, and each against those of the true surface, at the map's
+    surface voxels."""
     seen = ThingSurface(voxel_map, up=UP)
     nearest = nearest_points(seen.xyz, surface.xyz, max_distance_m=NEAR_M)
     things = seen.things
     class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), voxel_map.label_set)
-    confidence = np.array([thing.rank for thing in things], np.float32)
+    confidence = np.array([thing.certainty for thing in things], np.float32)
     matches = match_instances(
         FoundInstances(seen.number, class_id, confidence),
         np.append(surface.label, np.uint8(ROOMS.ignore_id))[nearest],
@@ -239,8 +248,7 @@ def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceReco
         ROOMS,
         STUFF_NAMES,
     )
-    found = tuple((m.class_id, m.confidence, m.iou, m.truth, m.neither) for m in matches.found)
-    return InstanceRecord(found=found, truth=matches.truth)
+    return things, matches
 
 
 def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[RoomLook], seed: int) -> UInt8:

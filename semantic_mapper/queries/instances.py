@@ -21,12 +21,42 @@ from semantic_mapper.mapping.blocks import BLOCK_VOXELS, pack_keys, unpack_keys
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.queries.checks import check_up
+from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
-SURE_VOXELS = 200  # smaller things are wrong more often
+LISTED = 0.35  # certainty from which on things are listed: here F1 is best and counts are nearest to the truth
+# Area of surface, m^2, from which on a piece of a class with mean confidence EVEN_CONFIDENCE is more likely right than
+# wrong; DEFAULT_M2 for classes that rooms lack. Fitted by ``python -m research.experiments.things --split fit``.
+EVEN_M2 = {
+    "bed": 0.754,
+    "table": 0.252,
+    "sink": 0.224,
+    "bathtub": 0.21,
+    "counter": 0.189,
+    "sofa": 0.186,
+    "window": 0.16,
+    "curtain": 0.156,
+    "refrigerator": 0.137,
+    "bookshelf": 0.135,
+    "cabinet": 0.127,
+    "toilet": 0.096,
+    "door": 0.048,
+    "chair": 0.035,
+    "desk": 0.032,
+    "otherfurniture": 0.02,
+    "picture": 0.014,
+    "otherprop": 0.009,
+}
+DEFAULT_M2, EVEN_CONFIDENCE = 0.03, 0.8
+CONFIDENCE_GAIN, AREA_GAIN = 9.42, 1.22  # log-odds a unit of confidence, and of the logarithm of area
+STRAY = 0.005  # of the points of a thing at either end of each axis that do not count for its box
+OWN_AXES = 0.8  # of the floor area of the box along the room's axes: a smaller one of its own axes is taken
+YAW_SAMPLE = 2000  # points that the room's axes are looked for in
+YAW_BIN_M = 0.02
+FLAT_M = 0.1  # of a thing that is thinner, only the better seen side of the two counts
 MAX_GONE = 64  # things that have gone, kept to be reported
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
 
@@ -53,13 +83,23 @@ class Instance:
     box: OrientedBox  # upright box round its surface points
     voxels: NDArray[np.int32]  # (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``
     measured: float = 1.0  # fraction of them that a sensor measured; the depth of the others was computed
+    certainty: float = 1.0  # probability that it is a thing of its class, IoU 0.25 or more; see ``certainty_of``
+    # fraction of its outside that was seen: of its silhouettes from the four sides of its box and from above, the area
+    # in which free space was seen before its surface; a side that stands at a wall counts as not seen
+    seen: float = 1.0
     # stamp of the frame at which most of it was gone; all else is as it was before. None = it is there.
     gone_ns: int | None = None
 
     @property
-    def rank(self) -> float:
-        """How sure it is against others, 0..1: confidence times the root of its size, up to ``SURE_VOXELS``."""
-        return self.confidence * min(1.0, len(self.voxels) / SURE_VOXELS) ** 0.5
+    def unsure(self) -> bool:
+        """Whether it is more likely a stray piece than a thing, and so is listed on request only."""
+        return self.certainty < LISTED
+
+
+def certainty_of(class_name: str, confidence: float, area_m2: float) -> float:
+    """Probability that a connected piece is a thing of its class, by mean confidence and area of its surface."""
+    size = AREA_GAIN * math.log(area_m2 / EVEN_M2.get(class_name, DEFAULT_M2))
+    return 1 / (1 + math.exp(-(CONFIDENCE_GAIN * (confidence - EVEN_CONFIDENCE) + size)))
 
 
 class ThingVoxels(NamedTuple):
@@ -108,7 +148,8 @@ class InstanceTracker:
     tenth. Of several that became one, the oldest id stays; of a split, the largest part keeps the id. A thing of which
     more than half was seen through since it was whole has gone (``gone``); what is left of it gets a new id. One that
     is only no longer found has not gone. Pieces below ``min_voxels`` are left out; ``up`` (3,) is along which boxes
-    stand."""
+    stand. Their sides run along the room's axes (the level directions that most surface of things runs along), or the
+    thing's own where it is clearly turned."""
 
     def __init__(self, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         if min_voxels < 1:
@@ -129,8 +170,10 @@ class InstanceTracker:
         with self._lock:
             return tuple(self._gone)
 
-    def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
-        """The instances of the map as it is now, by ascending id; ``MapError``: its lengths are not metres."""
+    def update(self, snapshot: MapSnapshot, *, unsure: bool = False) -> tuple[Instance, ...]:
+        """The instances of the map as it is now, by ascending id; those that are ``unsure`` only on request.
+
+        Raises MapError: lengths of the map are not metres."""
         require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(STUFF_NAMES))] = True
@@ -146,25 +189,32 @@ class InstanceTracker:
             ids[new] = self._next_id + np.arange(len(new))
             self._next_id += len(new)
             parts = dict(zip(ids.tolist(), np.split(found.order, found.ends[:-1]), strict=False))
-            things = [self._describe(snapshot, number, voxels, part) for number, part in sorted(parts.items())]
+            frame = _room_frame(voxels.point[found.order] * snapshot.voxel_size_m, self._up)
+            things = [self._describe(snapshot, number, voxels, part, frame) for number, part in sorted(parts.items())]
             self._last = _Found(voxels, found, ids, sizes)
             self._keep_whole(snapshot, things)
-        return tuple(things)
+        return tuple(thing for thing in things if unsure or not thing.unsure)
 
-    def _describe(self, snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64) -> Instance:
+    def _describe(
+        self, snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64, frame: Float64
+    ) -> Instance:
         row, voxel, labels = voxels.row[part], voxels.voxel[part].astype(np.int64), snapshot.label_set
         slot, class_id = snapshot.slots[row].astype(np.int64), int(voxels.label[part[0]])
-        xyz = voxels.point[part] * snapshot.voxel_size_m
+        xyz, name = voxels.point[part] * snapshot.voxel_size_m, labels.names[labels.ids.index(class_id)]
+        confidence = float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS)
+        box = upright_box(xyz, frame)
         return Instance(
             number,
             class_id,
-            labels.names[labels.ids.index(class_id)],
-            float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS),
+            name,
+            confidence,
             xyz.mean(axis=0),
-            upright_box(xyz, self._up),
+            box,
             unpack_keys(voxels.packed[row]) * 8
             + np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1).astype(np.int32),
             float(snapshot.measured(slot, voxel).mean()),
+            certainty_of(name, confidence, len(part) * snapshot.voxel_size_m**2),
+            _fraction_seen(snapshot, voxels.point[part], box),
         )
 
     def _match(self, last: _Found, voxels: ThingVoxels, found: Components, ids: Int64) -> None:
@@ -262,19 +312,61 @@ def connect_voxels(
     ...
 
 
-def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
-    """The level box of least floor area round points (N, 3), N > 0; one of its sides lies on their hull."""
-    frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
+def upright_box(xyz: Float64, frame: Float64) -> OrientedBox:
+    """The box round points (N, 3), N > 0, without strays, along the columns of ``frame`` (3, 3), whose third is up; or
+    along a side of their hull from above, where the floor area is then below ``OWN_AXES`` of that."""
     middle = xyz.mean(axis=0)
-    plan = ((xyz - middle) @ frame)[:, :2]
-    yaw = math.radians(cv2.minAreaRect(plan.astype(np.float32))[2]) % (math.pi / 2)
-    if np.diff(np.ptp(plan @ _turn(yaw), axis=0))[0] > 0:
+    plan = (xyz - middle) @ frame[:, :2]
+    own = math.radians(cv2.minAreaRect(plan.astype(np.float32))[2]) % (math.pi / 2)
+    least = YAW_BIN_M  # a thing without depth has no area
+    areas = [float(np.prod(np.ptp(_extent(plan @ _turn(yaw)), axis=0) + least)) for yaw in (0.0, own)]
+    yaw = own if areas[1] < OWN_AXES * areas[0] else 0.0
+    if np.diff(np.ptp(_extent(plan @ _turn(yaw)), axis=0))[0] > 0:
         yaw += np.pi / 2
     R = frame.copy()
     R[:, :2] = frame[:, :2] @ _turn(yaw)
-    own = (xyz - middle) @ R
-    low, high = own.min(axis=0), own.max(axis=0)
+    low, high = _extent((xyz - middle) @ R)
     return OrientedBox(middle + R @ ((low + high) / 2), high - low, R)
+
+
+def _extent(points: Float64) -> Float64:
+    """Lowest and highest value (2, D) of points (N, D) along each axis, without strays."""
+    few = int(STRAY * len(points))
+    ends = np.partition(points, (few, len(points) - 1 - few), axis=0) if few else np.sort(points, axis=0)
+    return ends[[few, len(points) - 1 - few]]
+
+
+def _room_frame(xyz: Float64, up: Float64) -> Float64:
+    """Axes (3, 3), columns, the third up: those along which points (N, 3) lie in the fewest level layers."""
+    frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
+    plan = (xyz[:: 1 + len(xyz) // YAW_SAMPLE] @ frame)[:, :2]
+
+    def sharpness(yaw: float) -> int:
+        bins = np.floor((plan @ _turn(yaw)) / YAW_BIN_M).astype(np.int64)
+        return sum(int((np.bincount(column - column.min()) ** 2).sum()) for column in bins.T)
+
+    if len(plan):
+        coarse = max(np.arange(0, np.pi / 2, np.pi / 90), key=sharpness)
+        frame[:, :2] = frame[:, :2] @ _turn(max(coarse + np.linspace(-1, 1, 9) * np.pi / 90, key=sharpness))
+    return frame
+
+
+def _fraction_seen(snapshot: MapSnapshot, point: Float64, box: OrientedBox) -> float:
+    """``Instance.seen`` of surface points (N, 3) in units of voxels."""
+    sides = np.concatenate((box.R_world_box.T, -box.R_world_box.T[:2]))  # x, y, up, -x, -y
+    before = np.ascontiguousarray((point + 1.5 * sides[:, None]).reshape(-1, 3))
+    free = read_states(before, snapshot).reshape(5, -1) == State.FREE
+    cell = np.floor(point @ box.R_world_box / 2).astype(np.int64)  # of two voxels: no gaps between those of a surface
+    cell -= cell.min(axis=0)
+    seen = whole = 0
+    for axis, pair in enumerate(((0, 3), (1, 4), (2,))):
+        a, b = np.delete(cell, axis, axis=1).T
+        number = a * (b.max() + 1) + b
+        areas = [np.count_nonzero(np.bincount(number[free[side]])) for side in pair]
+        flat = box.size[axis] < FLAT_M
+        seen += max(areas) if flat else sum(areas)
+        whole += np.count_nonzero(np.bincount(number)) * (1 if flat else len(pair))
+    return seen / whole
 
 
 def _turn(yaw: float) -> Float64:

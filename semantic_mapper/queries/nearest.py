@@ -9,9 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.blocks import BlockIndex
+from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point, check_points, check_positive
+from semantic_mapper.queries.instances import LISTED, MIN_VOXELS, certainty_of, find_components, thing_voxels
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
@@ -28,17 +30,20 @@ class NearestSurface:
 
 
 def nearest(
-    snapshot: MapSnapshot, class_name: str, point: ArrayLike, min_confidence: float = 0.0
+    snapshot: MapSnapshot, class_name: str, point: ArrayLike, min_confidence: float = 0.0, *, unsure: bool = False
 ) -> NearestSurface | None:
     """The surface point of a class that is nearest to a point (3,), world metres; ``None`` where the map has none.
 
-    Places that are less sure than ``min_confidence``, 0..1, do not count. ``LabelError``: no such class; lists those
-    there are. ``MapError``: a bad point or confidence."""
+    Of countable classes, only things that ``instances`` lists count; with ``unsure``, any surface. Places that are less
+    sure than ``min_confidence``, 0..1, do not count. ``LabelError``: no such class; lists those there are.
+    ``MapError``: a bad point or confidence."""
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
     if not 0 <= min_confidence <= 1:
         raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
     least = int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
+    if not unsure and snapshot.label_set.thing_ids(STUFF_NAMES).count(class_id):
+        return _nearest_of_things(snapshot, class_name, p, least)
     voxels, index = snapshot.voxels, snapshot.index
     rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
     count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, voxels.classes, rows, bounds)
@@ -53,6 +58,29 @@ def nearest(
         float(np.sqrt(found[3])) * snapshot.voxel_size_m,
         float(voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS,
         bool(voxels.weight.ravel()[place] == MEASURED),
+    )
+
+
+def _nearest_of_things(snapshot: MapSnapshot, class_name: str, p: Float64, least: int) -> NearestSurface | None:
+    """As ``nearest`` of a countable class, of the things that are listed; ``p`` (3,) is in units of voxels."""
+    found = thing_voxels(snapshot, np.arange(256) == snapshot.label_set.id_of(class_name))
+    pieces = find_components(found, MIN_VOXELS)
+    place = snapshot.slots[found.row].astype(np.int64) * BLOCK_VOXELS + found.voxel
+    confidence = snapshot.voxels.confidence.ravel()[place]
+    counts = np.zeros(len(place), np.bool_)
+    for part in np.split(pieces.order, pieces.ends[:-1]) if len(pieces.ends) else ():
+        mean = float(confidence[part].mean()) / CONFIDENCE_STEPS
+        counts[part] = certainty_of(class_name, mean, len(part) * snapshot.voxel_size_m**2) >= LISTED
+    chosen = np.flatnonzero(counts & (confidence >= least))
+    if not len(chosen):
+        return None
+    squares = ((found.point[chosen] - p) ** 2).sum(axis=1)
+    best = chosen[squares.argmin()]
+    return NearestSurface(
+        found.point[best] * snapshot.voxel_size_m,
+        float(np.sqrt(squares.min())) * snapshot.voxel_size_m,
+        float(confidence[best]) / CONFIDENCE_STEPS,
+        bool(snapshot.voxels.weight.ravel()[place[best]] == MEASURED),
     )
 
 

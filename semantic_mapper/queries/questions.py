@@ -161,6 +161,7 @@ class NearestRequest(Request[NearestSurface | None], frozen=True, kw_only=True):
     class_name: Word
     point: Point
     min_confidence: Finite = 0.0
+    unsure: bool = False
 
 
 class RaysRequest(Request[RayHits], frozen=True, kw_only=True):
@@ -180,11 +181,13 @@ class BoxRequest(Request[MapPoints], frozen=True, kw_only=True):
 
 
 class InstancesRequest(Request[tuple[Instance, ...]], frozen=True, kw_only=True):
-    """Countable things; ``gone``: also those that have gone lately."""
+    """Countable things; ``unsure``: also those that are more likely stray pieces; ``gone``: also those that have gone
+    lately."""
 
     takes_long: ClassVar[bool] = True
     up: Point
     gone: bool = False
+    unsure: bool = False
 
 
 class OccupancyRequest(Request[UInt8], frozen=True, kw_only=True):

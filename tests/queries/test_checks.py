@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,8 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.queries import nearest, occupancy, surface
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.snapshot import MapSnapshot
 from tests.queries.scene import whole
 
 NAN = float("nan")
@@ -76,3 +79,21 @@ def test_rays() -> None:
     refused("2 origins and 3 directions", np.zeros((2, 3)), np.ones((3, 3)))
     for far in (1e6, 0.0, NAN):
         refused("max_m must be above 0, at most 100", (0, 0, 0), (0, 0, 1), far)
+
+
+WITH_METRES: tuple[Callable[[MapSnapshot], object], ...] = (
+    lambda s: nearest.at(s, [(0, 0, 0)]),
+    lambda s: nearest.nearest(s, "cup", (0, 0, 0)),
+    lambda s: surface.cast_rays(s, (0, 0, 1), (0, 0, -1)),
+    lambda s: surface.points_in_box(s, (-1, -1, -1), (1, 1, 1)),
+    lambda s: occupancy.occupancy(s, [(0, 0, 0)]),
+    lambda s: occupancy.distance_field(s, (-1, -1, -1), (1, 1, 1)),
+    lambda s: InstanceTracker().update(s),
+)
+
+
+@pytest.mark.parametrize("query", WITH_METRES)
+def test_metres_are_refused_where_the_scale_is_unknown(query: Callable[[MapSnapshot], object]) -> None:
+    query(whole())
+    with pytest.raises(MapError, match=r"the scale is unknown; give a scale.*--distance"):
+        query(dataclasses.replace(whole(), scale_known=False))

@@ -57,7 +57,7 @@ def test_nearest_is_the_nearest_of_all(point: tuple[float, float, float], name: 
     least = 0.0 if quantile is None else float(np.quantile(confidence[mine], quantile)) / 255
     mine &= confidence >= np.ceil(least * 255 - 1e-9)
     distance = np.linalg.norm(xyz[mine] - point, axis=1)
-    hit = nearest(whole(), name, point, least)
+    hit = nearest(whole(), name, point, least, unsure=True)
     assert hit is not None
     assert hit.distance_m == pytest.approx(distance.min(), abs=1e-9)
     candidates = np.flatnonzero(distance <= distance.min() + 1e-9)

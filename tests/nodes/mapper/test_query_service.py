@@ -296,10 +296,10 @@ def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[t
     hangs, may_go_on = threading.Event(), threading.Event()
     update = InstanceTracker.update
 
-    def hang(self: InstanceTracker, snapshot: MapSnapshot) -> tuple[Instance, ...]:
+    def hang(self: InstanceTracker, snapshot: MapSnapshot, *, unsure: bool) -> tuple[Instance, ...]:
         hangs.set()
         assert may_go_on.wait(60)
-        return update(self, snapshot)
+        return update(self, snapshot, unsure=unsure)
 
     monkeypatch.setattr(InstanceTracker, "update", hang)
     yield hangs, may_go_on
@@ -364,8 +364,8 @@ def test_a_repeated_question_keeps_its_turn_and_old_ones_go(
 def test_a_bug_in_an_answer_spoils_no_later_one(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
     update = InstanceTracker.update
 
-    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot) -> None:
-        update(tracker, snapshot)
+    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot, *, unsure: bool) -> None:
+        update(tracker, snapshot, unsure=unsure)
         raise KeyError("a bug")
 
     monkeypatch.setattr(InstanceTracker, "update", half_way)
