@@ -110,6 +110,8 @@ def query(
                 **answer(world_map, question, name, point, up, min_confidence, gone, unsure, picture),
             }
         output.print(answer_table(found))
+        if found.get("found") is False and not unsure:
+            output.print("nothing is sure enough to be listed; --unsure also takes stray pieces")
     if out is not None:
         write_json(out, found)
     output.json(found)

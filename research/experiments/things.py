@@ -39,15 +39,11 @@ class Piece(NamedTuple):
     right: bool | None
 
 
-class Room(NamedTuple):
-    """What was found in a room, the surest first, and the true things by class."""
-
-    pieces: list[Piece]
-    truth: Counter[str]
+Room = tuple[list[Piece], Counter[str]]  # what was found, the surest first, and the true things by class
 
 
 def find_things(seed: int, suite: SuiteConfig, folder: Path) -> Room:
-    """The pieces of a room; its map and its true surface are kept in ``folder``."""
+    """The pieces and true things of a room; its map and its true surface are kept in ``folder``."""
     saved, rest = folder / f"{seed}-map.npz", folder / f"{seed}.npz"
     if not rest.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,18 +61,18 @@ def find_things(seed: int, suite: SuiteConfig, folder: Path) -> Room:
         taken |= {match.truth} if right else set()
         area = len(thing.voxels) * voxel_map.config.voxel_size_m**2
         pieces.append(Piece(thing, area, None if match.neither and not right else right))
-    return Room(pieces, Counter(names[number] for number in matches.truth))
+    return pieces, Counter(names[number] for number in matches.truth)
 
 
 def show(name: str, rooms: Sequence[Room], listed: Callable[[Instance], bool]) -> None:
     """Print precision, recall, F1 and count error of the pieces that count as things."""
     right, found, truth, error = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
-    for room in rooms:
-        chosen = [piece for piece in room.pieces if piece.right is not None and listed(piece.thing)]
+    for pieces, true_count in rooms:
+        chosen = [piece for piece in pieces if piece.right is not None and listed(piece.thing)]
         count = Counter(piece.thing.class_name for piece in chosen)
         right += Counter(piece.thing.class_name for piece in chosen if piece.right)
-        found, truth = found + count, truth + room.truth
-        error += Counter({key: abs(count[key] - room.truth[key]) for key in count | room.truth})
+        found, truth = found + count, truth + true_count
+        error += Counter({key: abs(count[key] - true_count[key]) for key in count | true_count})
     rows = [("all", right.total(), found.total(), truth.total(), error.total())]
     rows += [(key, right[key], found[key], truth[key], error[key]) for key, _ in truth.most_common()]
     print(f"{name}, {len(rooms)} rooms, IoU {IOU}")
@@ -133,7 +129,7 @@ def main() -> None:
     rooms = [find_things(seed, suite, arguments.folder) for seed in seeds]
     show("all pieces", rooms, lambda thing: True)
     show(f"certainty from {LISTED}", rooms, lambda thing: thing.certainty >= LISTED)
-    counted = [piece for room in rooms for piece in room.pieces if piece.right is not None]
+    counted = [piece for pieces, _ in rooms for piece in pieces if piece.right is not None]
     show_reliability(counted)
     if arguments.split == "fit":
         fit(counted)
