@@ -105,6 +105,8 @@ def test_what_query_instances_writes_is_a_file_of_boxes(tmp_path: Path) -> None:
     (sofa,) = load_boxes(tmp_path / "things.json").primitives
     assert (sofa.id, sofa.class_name, sofa.shape, sofa.thing) == (3, "sofa", "box", True)
     np.testing.assert_allclose(sofa.size, (0.5, 0.6, 0.001))  # the flattest box that there is
+    (wider,) = load_boxes(tmp_path / "things.json", query_margin_m=0.05).primitives
+    np.testing.assert_allclose(wider.size, (0.6, 0.7, 0.1))
     np.testing.assert_allclose(sofa.T_world_box, T, atol=1e-4)
 
 
