@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from base64 import b64decode
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -127,6 +128,10 @@ class Browser:
         button = "none" if kind == "mouseMoved" and not buttons else "left"
         where = {"x": place[0], "y": place[1], "button": button, "buttons": buttons}
         self._order("Input.dispatchMouseEvent", type=kind, clickCount=int(kind != "mouseMoved"), **where)
+
+    def picture(self) -> bytes:
+        """What is to be seen of the page, as a PNG file."""
+        return b64decode(self._order("Page.captureScreenshot", format="png")["data"])
 
     def wait(self, seconds: float) -> None:
         """Let the page work on, and take in what it says."""

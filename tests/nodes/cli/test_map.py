@@ -14,6 +14,7 @@ from semantic_mapper.replay.run_folder import hold_folder
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,
+    is_alive,
     refused,
     repeated_frames,
     run,
@@ -92,6 +93,21 @@ def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
     assert summary["metrics"]["miou"] is not None and "demo.mcap" in said
     for name in ("map.ply", "map.npz", "overview.png"):
         assert (out / name).stat().st_size > 0 and name in said
+
+
+@pytest.mark.slow  # three processes and a viewer
+def test_live_demo_runs_until_ctrl_c_while_another_terminal_asks(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    with Running("demo", "--live", "--out", out) as running:
+        query = running.wait_for_line("query .* nearest chair").split()[1:]
+        running.wait_for_line("watch at http://127.0.0.1:")
+        running.wait_for_line(r"map_saved.*frames=(2[5-9]|[3-9]\d|\d{3})\b")  # in the second loop
+        assert "found" in run_ok(*query).stdout
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 0, running.text
+        assert not any(map(is_alive, running.node_pids())) and not running.sockets().exists()
+    summary = summary_of(out)
+    assert summary["frames"]["scored"] <= 24 < summary["frames"]["fused"] and summary["metrics"]["miou"] > 0.7
 
 
 def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
