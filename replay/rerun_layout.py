@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plots import (
     DIM_TEXT,
@@ -23,7 +24,7 @@ from semantic_mapper.plots import (
     rendered,
 )
 from semantic_mapper.replay.overview import open_side
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,33 +35,38 @@ CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
-DISTANCE = 0.8  # of the eye, times the map's diagonal
+DISTANCE = 0.95  # of the eye, times the map's diagonal
 _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
 class Eye(NamedTuple):
-    """From where the map is looked at first: position, target and up (3,), world metres; and how far along up its
-    ceiling begins, infinite where it has none."""
+    """From where the map is looked at first: position, target and up (3,), world metres."""
 
     position: Float64
     target: Float64
     up: Float64
-    ceiling: float
 
 
 def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
-    """An eye on a map, points (N, 3), N > 0, from above, on its most open side; what is above its ceiling is not to be
-    shown then. ``up`` (3,) is a first guess of which way is up; None = unknown."""
+    """An eye on a map, points (N, 3), N > 0, from above, on its most open side. ``up`` (3,) is a first guess of which
+    way is up; None = unknown."""
     R_upright_world = upright_rotation(xyz, up)
     upright = xyz.astype(np.float64) @ R_upright_world.T
-    ceiling = ceiling_height(upright)
-    low, high = np.percentile(upright if ceiling is None else upright[upright[:, 2] < ceiling], (1, 99), axis=0)
+    low, high = np.percentile(upright, (1, 99), axis=0)
     target, size = (low + high) / 2, np.maximum(high - low, 0.3)
     azimuth = open_side(upright)
-    direction = np.array((np.cos(azimuth) * np.cos(ELEVATION), np.sin(azimuth) * np.cos(ELEVATION), np.sin(ELEVATION)))
+    level = np.cos(ELEVATION)
+    direction = np.array((np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(ELEVATION)))
     position = target + DISTANCE * float(np.linalg.norm(size)) * direction
-    ceiling = np.inf if ceiling is None else ceiling
-    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2], ceiling)
+    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2])
+
+
+def in_ceiling(xyz: Float32, up: Float64) -> Bool:
+    """Which points (N, 3) of a map are its ceiling, or above it, (N,): without them one can look in from above."""
+    level = turn_onto(up, np.array((0.0, 0.0, 1.0)))
+    upright = xyz.astype(np.float64) @ level.T
+    cut_m = ceiling_height(upright)
+    return np.zeros(len(xyz), np.bool_) if cut_m is None else upright[:, 2] >= cut_m
 
 
 def scale_colors(level: Float32, scale: int) -> UInt8:

@@ -37,6 +37,7 @@ from semantic_mapper.replay.rerun_layout import (
     camera_path,
     draw_map_legend,
     eye_on,
+    in_ceiling,
     layout,
     scale_colors,
 )
@@ -82,6 +83,7 @@ class RerunLog:
         self._lock = threading.Lock()
         self._cameras: list[str] = []
         self._paths: dict[str, CameraPath] = {}
+        self._up: Float64 | None = None  # as the floor says, once it is known
         self._eye: Eye | None = None
         self._colourings: list[str] = ["class"]  # of the map
         self._extent_m = -1.0  # of the map when the eye was set
@@ -109,7 +111,7 @@ class RerunLog:
     def log_frame(self, frame: PosedFrame, *, posed: bool = True) -> None:
         """A camera image with its pose, or the image alone where its pose is not of the map's world."""
         path, k, T = self._camera(frame.camera_id), _as_logged(frame.intrinsics), frame.T_world_camera
-        self._set_time(frame.stamp_ns, frame.seq)
+        self.set_time(frame.stamp_ns, frame.seq)
         rgb = cv2.resize(frame.rgb, (k.width, k.height), interpolation=cv2.INTER_AREA)
         self._stream.log(f"{path}/image/rgb", rr.Image(np.asarray(rgb, np.uint8)).compress(jpeg_quality=JPEG_QUALITY))
         if not posed:
@@ -132,7 +134,7 @@ class RerunLog:
         """What was rendered for a frame of a camera with these intrinsics, and how long it took."""
         path, k = self._camera(update.camera_id), _as_logged(intrinsics)
         size = k.width, k.height
-        self._set_time(update.stamp_ns, update.seq)
+        self.set_time(update.stamp_ns, update.seq)
         label = cv2.resize(update.label, size, interpolation=cv2.INTER_NEAREST_EXACT)
         self._stream.log(f"{path}/image/semantics", rr.SegmentationImage(np.asarray(label, np.uint8)))
         depth = cv2.resize(update.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -141,16 +143,12 @@ class RerunLog:
         for stage, value in update.stage_ms.items():
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
-    def log_map(self, points: MapPoints, age_s: Float32 | None = None, stamp_ns: int | None = None) -> None:
+    def log_map(self, points: MapPoints, age_s: Float32 | None = None) -> None:
         """The map as it is now, in all colourings that it has something to tell in.
 
-        Args:
-            points: Of its surface.
-            age_s: (N,) seconds since each point's surroundings last changed; None = not known.
-            stamp_ns: Of the newest frame in it; None = that which was logged last by this thread, if any was.
+        ``points`` are of its surface, ``age_s`` (N,) seconds since each point's surroundings last changed; None = not
+        known.
         """
-        if stamp_ns is not None:
-            self._set_time(stamp_ns, None)
         computed = computed_fraction(points)
         for camera, path in list(self._paths.items()):
             positions = np.stack([T[:3, 3] for T in list(path.poses)])
@@ -166,9 +164,7 @@ class RerunLog:
         if age_s is not None:
             looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
         self._look_at(points, list(looks))
-        above = np.zeros(len(points.xyz), np.bool_)
-        if self._eye is not None:
-            above = points.xyz @ self._eye.up >= self._eye.ceiling
+        above = np.zeros(len(points.xyz), np.bool_) if self._eye is None else in_ceiling(points.xyz, self._eye.up)
         for name, look in looks.items():
             for part, kept in ("", ~above), (f"/{CEILING}", above):
                 shown = {kind: values[kept] for kind, values in look.items()}
@@ -181,6 +177,7 @@ class RerunLog:
 
         Where things were that are ``gone`` is drawn in grey, with the stamp of when they went.
         """
+        self._up = graph.up
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
         self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR))
         names, middles = room_names(graph), np.array([room.center for room in graph.rooms]).reshape(-1, 3)
@@ -219,9 +216,9 @@ class RerunLog:
 
     def finish(self, points: MapPoints, graph: SceneGraph | None = None) -> None:
         """The finished map; ends the recording."""
-        self.log_map(points)
         if graph is not None:
             self.log_graph(graph)
+        self.log_map(points)
         self.close()
 
     def close(self) -> None:
@@ -254,14 +251,16 @@ class RerunLog:
         if self._colourings == colourings and extent <= REGROWN * self._extent_m:
             return
         poses = [T for path in list(self._paths.values()) for T in list(path.poses)]
-        self._eye = eye_on(points.xyz, camera_up(np.stack(poses)) if poses else None)
+        up = camera_up(np.stack(poses)) if self._up is None and poses else self._up
+        self._eye = eye_on(points.xyz, up)
         self._colourings, self._extent_m = colourings, extent
         self._lay_out()
 
     def _lay_out(self) -> None:
         self._stream.send_blueprint(layout(self._cameras, self._colourings, self._eye))
 
-    def _set_time(self, stamp_ns: int, seq: int | None) -> None:
+    def set_time(self, stamp_ns: int, seq: int | None = None) -> None:
+        """As of when is what this thread shows from now on; frames set it by themselves."""
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
         if seq is not None:
             self._stream.set_time("frame", sequence=seq)

@@ -1,6 +1,6 @@
-"""Make the pictures of README and docs/robots.md from the recorded room: ``python -m tools.pictures``.
+"""Make the pictures of README from the recorded room: ``python -m tools.pictures``.
 
-Recordings of real places, whose licences forbid it, are not shown. The browser is that of the tests of pages.
+No real recording at hand may be shown: redkitchen is for research alone. The browser is that of the tests of pages.
 """
 
 from __future__ import annotations

@@ -64,12 +64,13 @@ class MapShow:
         if self._shown is not None and np.array_equal(snapshot.serials, self._shown):
             return
         self._shown = snapshot.serials
+        self._log.set_time(stamp_ns)
+        self._show_graph(snapshot)  # it knows which way is up
         ages_s = self._ages.follow(snapshot, stamp_ns / 1e9)
         surface = surface_voxels(snapshot)
         points = surface_points(snapshot, surface)
         ages = ages_s[surface.row].astype(np.float32)[:: thinning(len(points.xyz))]
-        self._log.log_map(thinned(points), ages, stamp_ns)
-        self._show_graph(snapshot)
+        self._log.log_map(thinned(points), ages)
 
     def _show_graph(self, snapshot: MapSnapshot) -> None:
         """Rooms and things, now and then; none where lengths are not metres, or the floor is not known yet."""
