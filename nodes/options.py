@@ -156,7 +156,7 @@ class RecorderOptions(Config, frozen=True):
     source_timeout_s: Positive = 180.0  # how long the others may take to start
     split_mb: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part before one grows beyond this; 0 = any size
     split_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part after this many seconds; 0 = any time
-    # Where the disk is full: "stop" recording, or "delete-oldest" parts of this recording. The other nodes go on.
+    # Where the disk is full: "stop" recording, or "delete-oldest" parts of it
     disk_full: Literal["stop", "delete-oldest"] = "stop"
     reserve_mb: Annotated[float, msgspec.Meta(ge=0)] = 500.0  # so much of the disk is left free: then it counts as full
     # Colour images: "as-sent" (cameras send PNG, which is lossless), "png", or "jpeg", some seven times smaller.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -192,7 +192,7 @@ class KeyframeConfig(Config, frozen=True):
 class VoxelMapConfig(Config, frozen=True):
     """The fused map."""
 
-    voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02  # edge of a voxel
+    voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02  # edge of a voxel, metres
     depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
@@ -276,8 +276,8 @@ DepthSource = Literal["auto", "sensor", "computed", "off"]
 class DepthConfig(Config, frozen=True):
     """Where the depth of frames comes from."""
 
-    # "auto": the sensor's, else computed from the pictures; "computed": always; "sensor", "off": rendered by the field
-    # where a frame has none, or always
+    # "auto": the sensor's, else computed from pictures; "computed": always; "sensor": rendered by the field where a
+    # frame has none; "off": always rendered
     source: DepthSource = "auto"
     from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
     # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
@@ -321,7 +321,7 @@ class MapperConfig(Config, frozen=True):
     virtual: VirtualViewConfig = VirtualViewConfig()
     moving: MovingConfig = MovingConfig()
     render: RenderConfig = RenderConfig()
-    quality: Quality = "custom"  # few, some or all rays and samples; "custom" as set
+    quality: Quality = "custom"  # few, some or all rays; "custom": as set
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0  # of everything that is drawn at random
 
 
@@ -397,16 +397,34 @@ def load_mapper_config(
     return convert_config(data, MapperConfig, where)
 
 
-def parse_assignments(texts: Iterable[str]) -> dict[str, Any]:
-    """What ``--set NAME=VALUE`` says, by name; values as of ``parse_value``. Raises ConfigError: not of this form."""
-    return {name: parse_value(value) for name, value in map(split_assignment, texts)}
+def parse_assignments(texts: Iterable[str], kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """What ``--set NAME=VALUE`` says, by dotted name; values as of ``parse_value``. Raises ConfigError: not of this
+    form, or ``kind`` has no such setting (the nearest one is named)."""
+    found = {name: parse_value(value) for name, value in map(split_assignment, texts)}
+    known = list(setting_names(kind)) if found else []
+    for name in found:
+        if not any(f"{name}.".startswith(f"{k}.") or k.startswith(f"{name}.") for k in known):
+            by_last = {k.rpartition(".")[2]: k for k in known} | {k: k for k in known}
+            near = difflib.get_close_matches(name, by_last, n=1, cutoff=0.5)
+            hint = f"did you mean `{by_last[near[0]]}`?" if near else "docs/settings.md lists all"
+            raise ConfigError(f"--set {name}: there is no such setting; {hint}")
+    return found
+
+
+def setting_names(kind: type[msgspec.Struct], prefix: str = "") -> Iterator[str]:
+    """Dotted names of the settings of a struct, and of the structs in it."""
+    for item in msgspec.structs.fields(kind):
+        if isinstance(item.type, type) and issubclass(item.type, msgspec.Struct):
+            yield from setting_names(item.type, f"{prefix}{item.encode_name}.")
+        else:
+            yield prefix + item.encode_name
 
 
 def split_assignment(text: str) -> tuple[str, str]:
     """Name and value of NAME=VALUE. Raises ConfigError: not of this form."""
     name, equals, value = text.partition("=")
     if not equals or not name:
-        raise ConfigError(f"--set {text}: write NAME=VALUE, such as seed=1")
+        raise ConfigError(f"--set {text}: write NAME=VALUE; docs/settings.md lists the names")
     return name, value
 
 

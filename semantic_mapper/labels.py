@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.config import nearest
 from semantic_mapper.errors import LabelError
 from semantic_mapper.types import UInt8
 
@@ -77,9 +78,11 @@ class LabelSet:
         return table[label]
 
     def id_of(self, name: str) -> int:
-        """Id of a class. Raises LabelError: no class of that name; lists those there are."""
+        """Id of a class. Raises LabelError: no class of that name; says the nearest one, and all."""
         if name not in self.names:
-            raise LabelError(f"label set '{self.name}' has no class '{name}'; it has {', '.join(self.names)}")
+            hint = nearest(name, self.names)
+            rest = f" It has {', '.join(self.names)}" if hint.endswith("?") else ""
+            raise LabelError(f"label set '{self.name}' has no class '{name}'{hint}{rest}")
         return self.ids[self.names.index(name)]
 
     def thing_ids(self, stuff: Collection[str]) -> tuple[int, ...]:

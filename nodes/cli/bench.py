@@ -21,10 +21,11 @@ def bench(
     frames: AtLeastOne = 20,  # frames that count
     weights: WeightsOption = None,
 ) -> None:
-    """Measure speed on this machine, on frames of 640x480.
+    """Measure speed on this machine.
 
-    fusion: frames into 2 cm voxels, ours with 20 and 40 classes against Open3D's own without any. pipeline: whole
-    steps, frames in, the semantic map out. Quote ratios, not seconds: seconds depend on the machine and its load.
+    On frames of 640x480. fusion: frames into 2 cm voxels, ours with 20 and 40 classes against Open3D's own without any.
+    pipeline: whole steps, frames in, the semantic map out. Quote ratios, not seconds: seconds depend on the machine and
+    its load.
 
     Example: semantic-mapper bench pipeline --frames 30 --quality fast
     Example: semantic-mapper bench fusion --json

@@ -16,7 +16,7 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.calibration import report
 from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.calibration.sources import Gathering, parse_sources
-from semantic_mapper.nodes.cli.verb import JsonOutput, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, verb, wrong_usage
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.run_folder import folder_for_results, prepare_file
@@ -31,25 +31,26 @@ def calibrate(
     out: Path = Path("calibration"),  # folder for NAME.toml and NAME.png
     board: Path | None = None,  # write the board, to be printed, to this PNG file
     config: Path | None = None,  # TOML file with [board] (as a pose source of kind board) and [calibration]
-    square_mm: float = 0.0,  # side of a square as measured on the printed board; markers scale with it
-    size: str = "",  # WIDTHxHEIGHT to ask of V4L2 cameras: that of their later use
+    square_mm: float = 0.0,  # side of a square, as measured on the printed board
+    size: str = "",  # WIDTHxHEIGHT of V4L2 cameras, as later in use
     known: bool = False,  # keep the intrinsics that the source tells; find the rig alone
     stereo: bool = False,  # the source gives two images side by side: one file for the pair
     seconds: float = 180.0,  # how long to look through live cameras, at most
 ) -> None:
-    """Calibrate cameras from images of a printed ChArUco board, and where they sit on a rig that has several.
+    """Calibrate cameras from images of a printed ChArUco board.
 
     Print the board (--board), glue it to something flat, measure a square (--square-mm). Show it to the camera near and
-    far, at all edges and corners of the image, leaning up, down and to both sides; hold it still each time. Cameras of
-    a rig have to see it at the same time; the first one is where the rig is. Poor coverage is refused, with what is
-    missing. Drivers take NAME.toml as `calibration`.
+    far, at all edges and corners of the image, leaning up, down and to both sides; hold it still each time. Several
+    cameras are a rig: they have to see it at the same time, and the first one is where the rig is. Poor coverage is
+    refused, with what is missing. Drivers take NAME.toml as `calibration`.
 
     Example: semantic-mapper calibrate --board board.png
     Example: semantic-mapper calibrate v4l2:/dev/video0 --size 1280x720 --square-mm 39.6 --out calibration
     Example: semantic-mapper calibrate --stereo v4l2:/dev/video0 --size 2560x720 --square-mm 39.6
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
-    settings = board_settings(config, square_mm)
+    with wrong_usage():
+        settings = board_settings(config, square_mm)
     if board is not None:
         _draw_board(output, settings, board)
         if not sources:

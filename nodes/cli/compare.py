@@ -25,7 +25,7 @@ def compare(
     labels: AtLeastZero = _DEFAULT.labels,  # allowed fraction of points with another class
     exact: bool = False,  # the maps must be the same, byte for byte
 ) -> int:
-    """Compare two runs of one log: counts, scores, and how far the maps are apart.
+    """Compare two results of one log: scores and surfaces.
 
     Exit codes: 0 equal, 1 different, 2 wrong usage, or something that cannot be read.
 

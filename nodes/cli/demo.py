@@ -37,9 +37,10 @@ def demo(
     out: Path = Path("runs/demo"),  # folder for the results; made if missing
     weights: WeightsOption = None,
 ) -> int:
-    """Map a recorded log that comes with the package: a depth camera in a furnished room.
+    """Map a recorded log that comes with the package.
 
-    Ends with a map, a picture and a summary in OUT. Needs no camera, no data and no network.
+    It is of a depth camera in a furnished room. Ends with a map, a picture and a summary in OUT. Needs no camera, no
+    data and no network.
 
     With --live, camera, mapper and viewer are processes that run until Ctrl-C, which writes the map; meanwhile another
     terminal asks it: `semantic-mapper query live nearest chair 0 0 1`. It is the launch file `camera` with a log in

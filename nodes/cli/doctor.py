@@ -9,7 +9,7 @@ import typer
 from rich.text import Text
 
 from semantic_mapper.drivers.registry import KINDS, find_cameras
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, table
 from semantic_mapper.nodes.doctor import examine
 
@@ -23,7 +23,7 @@ def doctor(
     cameras: bool = False,  # list the cameras that are connected instead, as a config names them
     kind: list[str] | None = None,  # --cameras: only this kind (v4l2, stereo, oak, realsense); may be repeated
 ) -> int:
-    """Look for what this machine lacks, with a fix for each thing; or list its cameras.
+    """Say what this machine lacks, and the fix; list its cameras.
 
     Exit code 1 where something needed is missing. Video files and streams (kind opencv) are named, not found. A kind of
     camera whose packages are missing is reported, too.
@@ -44,7 +44,8 @@ def doctor(
 
 
 def _list_cameras(output: Output, kinds: Sequence[str]) -> None:
-    found, unknown = find_cameras(tuple(kinds) or KINDS)
+    with wrong_usage():
+        found, unknown = find_cameras(tuple(kinds) or KINDS)
     if found:
         rows = [(camera.kind, camera.name, camera.address, camera.note) for camera in found]
         output.print(table(rows, ("kind", "name", "address", "note"), title="cameras"))

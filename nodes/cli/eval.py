@@ -32,22 +32,23 @@ from semantic_mapper.replay.summary import notes, percent, read_summary, result_
 def evaluate(
     output: JsonOutput,
     mapper: MapperSettings,
-    # Folders of `map`; logs, or folders with their parts
-    targets: Annotated[list[Path], typer.Argument(metavar="DIR_OR_LOG...")],
+    # folders of `map`; logs, or folders with their parts
+    targets: Annotated[list[Path], typer.Argument(metavar="DIR|LOG")],
     *,
     weights: WeightsOption = None,
     baselines: bool = False,  # LOG: also fit baselines to the keyframes
     seconds: AtLeastZero = 300.0,  # --baselines: to train the U-Net
     mesh: Path | None = None,  # DIR: a reference mesh (.npz) to compare with
-    # LOG: its true objects, [CAMERA/]NNNNNN.png (0 = none), for panoptic quality
+    # LOG: true objects, [CAMERA/]NNNNNN.png, for panoptic quality
     instances: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     max_frames: MaxFramesOption = 0,
     out: Path | None = None,  # JSON [DIR/eval.json or LOG.eval.json]
 ) -> None:
-    """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML next to it.
+    """Score logs, and results of `map`: figures, and a page.
 
-    A DIR gives the figures of its replay. A LOG is mapped and scored; keyframes of its weights never count. --baselines
-    adds a per-image U-Net and labels carried over by depth, made from those keyframes.
+    A DIR gives the figures of its `map`. A LOG is mapped and scored; keyframes of its weights never count. --baselines
+    adds a per-image U-Net and labels carried over by depth, made from those keyframes. Writes JSON, and HTML next to
+    it.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines

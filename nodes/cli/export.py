@@ -11,7 +11,7 @@ from semantic_mapper.config import Fraction, NotNegative
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.verb import JsonOutput, UpOption, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, UpOption, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
 from semantic_mapper.nodes.fleet.store import is_url
@@ -34,36 +34,34 @@ Pair = tuple[float, float]
 @verb
 def export(
     output: Output,
-    # Saved map, log, or a folder: of results, or of parts of a log
+    # saved map, log, or a folder with one
     source: Annotated[Path, typer.Argument(metavar="MAP|LOG")],
     *,
     out: Path,  # file to write; its ending says the format
-    # where the ending does not say it: ply and npz are points, ply-mesh, obj and glb meshes
+    # where the ending does not say it
     format_: Literal[Format, LogFormat] | None = None,
     color: Literal["rgb", "class", "confidence"] | None = None,  # of points and meshes; rgb without it
-    min_weight: float = SURFACE_WEIGHT,  # leave out voxels that fewer measurements have seen; 1: and computed depth
-    min_confidence: Fraction = 0.0,  # leave surface with a less sure label out
+    min_weight: float = SURFACE_WEIGHT,  # leave out voxels seen less; 1: also of computed depth
+    min_confidence: Fraction = 0.0,  # leave out surface of less sure class
     up: UpOption = "auto",
-    # grid: what is in a robot's way, above the floor; without it 0.1 to 1.8 m
+    # grid: what is in the way, above the floor [0.1 1.8]
     height: Annotated[Pair | None, typer.Option(metavar="LOW HIGH")] = None,
-    resolution: float | None = None,  # grid: side of a cell in metres; without it 0.05
-    floor: float | None = None,  # grid: height of the floor; found when not given
-    costs: Path | None = None,  # grid: also write costs by class, from lines of a TOML file such as `person = 100`
+    resolution: float | None = None,  # grid: side of a cell, metres [0.05]
+    floor: float | None = None,  # grid: height of the floor [found]
+    costs: Path | None = None,  # grid: also write costs, of a TOML file with lines `person = 100`
     camera: str = "",  # logs: the frames of this camera only
     max_frames: NotNegative = 0,  # logs: stop after this many; 0 = all
 ) -> None:
     """Write a saved map, or a log, in a format of other programs.
 
-    Maps: .ply points (with --format ply-mesh a mesh), .obj mesh, .glb mesh for viewers, .npz arrays for
-    numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
-    floor was seen. With --costs the costs 0 to 100 of its cells are written next to it (mode raw, unknown 255).
+    Maps: .ply points, .obj and .glb meshes, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for nav2: a cell is
+    free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown 255).
 
-    Logs: .mcap with Foxglove's schemas, .rrd for Rerun, .txt trajectory (TUM), a folder that `import` reads again
-    without loss, or with --format tum a TUM RGB-D sequence.
+    Logs: .mcap for Foxglove, .rrd, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
+    --format tum a TUM RGB-D sequence.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
-    Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --height 0.1 1.2
-    Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --costs costs.toml
+    Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2 --costs costs.toml
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     map_options = (color, height, resolution, floor, costs, up, min_weight, min_confidence)
@@ -75,7 +73,8 @@ def export(
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
     of_grid = (height, resolution, floor, costs)
-    request = ExportRequest(format_of(out, format_), min_weight, min_confidence, color, parse_up(up), *of_grid)
+    with wrong_usage():
+        request = ExportRequest(format_of(out, format_), min_weight, min_confidence, color, parse_up(up), *of_grid)
     path = map_path(source)
     refuse_overwriting(out, path)
     prepare_file(out)
@@ -106,11 +105,12 @@ def merge(
     # JSON: an object of [x, y, z, yaw_deg] or 4 rows of 4 by names of maps; poses of others are found by what they show
     poses: Path | None = None,
 ) -> None:
-    """Make one map of several: what all have measured adds up.
+    """Merge maps of one place into one map.
 
-    Where a map lies is found by the features that maps keep, and refused where it is uncertain. The world is that of
-    the first map, or of --poses. Shifts by whole voxels are exact; for others, voxels are interpolated. A map is named
-    by its log, its file or its folder. Settings are those of the first map; what does not fit in memory goes to disk.
+    What all have measured adds up. Where a map lies is found by the features that maps keep, and refused where it is
+    uncertain. The world is that of the first map, or of --poses. Shifts by whole voxels are exact; for others, voxels
+    are interpolated. A map is named by its log, its file or its folder. Settings are those of the first map; what does
+    not fit in memory goes to disk.
 
     Example: semantic-mapper merge runs/east runs/west runs/attic --out house.npz
     Example: semantic-mapper merge runs/fleet --poses poses.json --out house.npz

@@ -33,21 +33,21 @@ def finetune(
     keyframes: AtLeastTwo | None = None,  # how many labelled frames to use
     weights: Path | None = None,  # to start from, in place of the package's
     from_scratch: bool = False,  # start from random weights
-    # field of the scene, from all frames; irt: classes of keyframes, panoptic: of boxes and pseudo labels, grid: none
+    # of this scene alone; classes of keyframes (irt), of boxes (panoptic), or none (grid)
     kind: Literal["irt", "panoptic", "grid"] | None = None,
-    boxes: Path | None = None,  # panoptic: a file of boxes (docs/scenes.md)
-    # panoptic: pseudo labels, NNNNNN.png or weights, in place of the log's
+    boxes: Path | None = None,  # panoptic: a file of boxes
+    # panoptic: in place of the log's labels
     pseudo: Annotated[str | None, typer.Option(metavar="DIR|WEIGHTS")] = None,
-    uncovered: Literal["stuff", "empty"] = "stuff",  # panoptic: what is outside of all boxes
+    uncovered: Literal["stuff", "empty"] = "stuff",  # panoptic: outside of all boxes
     depth: DepthSource = "sensor",  # as of `map`
-    # label images NNNNNN.png in place of the log's (`label --serve`); all of them without --keyframes
+    # NNNNNN.png of `label --serve` in place of the log's; all of them without --keyframes
     labels: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     strokes: bool = False,  # labels are strokes: let each grow
 ) -> int:
-    """Fit the field to a few labelled keyframes of a log.
+    """Fit weights to a few labelled keyframes of a log.
 
-    The keyframes are those that together show most of what the log shows; no other label is trained on, and `map`
-    and `eval` never score on them. Ctrl-C writes the best weights so far (exit code 130).
+    The keyframes are those that together show most of the log; no other label is trained on, and `map` and `eval`
+    never score on them. Ctrl-C writes the best weights so far (exit code 130). See docs/scenes.md.
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors

@@ -14,7 +14,16 @@ from rich.table import Table
 from semantic_mapper.config import AtLeastZero, MapperConfig
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, EXIT_USAGE, JsonOutput, SetOption, Settings, show_error, verb
+from semantic_mapper.nodes.cli.verb import (
+    EXIT_FAILED,
+    EXIT_USAGE,
+    JsonOutput,
+    SetOption,
+    Settings,
+    show_error,
+    verb,
+    wrong_usage,
+)
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.console import table as make_table
 from semantic_mapper.nodes.fleet.cluster import connected
@@ -30,7 +39,7 @@ MAX_LOGS = 40
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Map, score, label and finetune many logs, on this machine or a Ray cluster.",
+    help="Map, score, label and finetune many logs. On this machine, or a Ray cluster (docs/fleet.md).",
 )
 
 
@@ -67,7 +76,8 @@ def run(
 
     kind = OPERATIONS[operation]
     on_gpu = ["render.device=cuda"] if gpus and issubclass(kind.settings, MapperConfig) else []
-    task = make_task(operation, out, weights, [*on_gpu, *(settings or ())], config)
+    with wrong_usage():
+        task = make_task(operation, out, weights, [*on_gpu, *(settings or ())], config)
     with (
         StopRequest() as stop,
         connected(address, worker_logs=Settings.verbose),

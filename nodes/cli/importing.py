@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config
+from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config, nearest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
-from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, refuse_options, verb
+from semantic_mapper.nodes.cli.verb import MaxFramesOption, Options, OverwriteOption, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import MEGAPIXELS, ImportOptions, ImportReport, RenameConfig
@@ -45,7 +45,7 @@ class SourceOptions(Options, frozen=True):
     distance: str = ""  # film: "SECONDS:U,V SECONDS:U,V METRES"
     square_mm: AtLeastZero = 0.0  # film: side of a board's square in it
     camera_height: AtLeastZero = 0.0  # film: over the floor, metres
-    # bags: ROLE=NAME of image, depth, info, depth_info or pose; repeated. depth=none (any format): without depth
+    # bags: ROLE=NAME (image, depth, info, depth_info, pose); repeated. depth=none (any format): without depth
     topic: list[str] | None = None
     world: str = ""  # bags: frame of tf that poses are in
     body: str = ""  # bags: frame that poses are of
@@ -88,7 +88,7 @@ class SourceOptions(Options, frozen=True):
 @verb
 def import_(
     output: Output,
-    # Recording, ROS bag, film, folder of pictures, or damaged log
+    # recording, ROS bag, film, pictures, or damaged log
     source: Annotated[Path, typer.Argument(metavar="SRC")],
     log: Path,  # log to write (.mcap)
     options: SourceOptions,
@@ -102,17 +102,18 @@ def import_(
     rename: Path | None = None,  # TOML: [classes] couch = "sofa", ...
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make a log of a recording of another program, of a film, or of a damaged log.
+    """Make a log of a film or of a recording of another program.
 
-    Frames that cannot be used are left out, with the reason. --rotate is for cameras mounted on their side. Poses of a
-    film or a folder of pictures are found; its lengths are metres by GPS of the pictures or by one of --scale,
-    --distance, --square-mm, --camera-height. Of a damaged log every intact message is kept. See docs/layouts.md.
+    Frames that cannot be used are left out, with the reason. Poses of a film or a folder of pictures are found; its
+    lengths are metres by GPS of the pictures or by one of --scale, --distance, --square-mm, --camera-height. Of a
+    damaged log every intact message is kept. See docs/layouts.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
-    refuse_options((format_ not in (None, *FORMATS), "--format", f"there are {', '.join(FORMATS)}"))
+    if format_ not in (None, *FORMATS):
+        raise typer.BadParameter(f"'{format_}' is not valid{nearest(format_, list(FORMATS))}", param_hint="--format")
     if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
         _recover(output, source, log)
         return

@@ -43,7 +43,7 @@ def info(
     picture: Path | None = None,  # draw boxes over the three frames of this log that show most of them
     out: Path | None = None,  # --picture: what to write (.png, .jpg)
 ) -> int:
-    """Say what a log, a map or a file of boxes holds, or which weights a mapper uses.
+    """Say what a log, a map, weights or a file of boxes holds.
 
     Of a log (topics, frames, cameras, duration, missing frames, damage) it reads every message, so that damage
     anywhere is found; exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file

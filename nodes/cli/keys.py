@@ -21,7 +21,7 @@ def keys(
     # folder of the keys; without it this user's
     folder: Annotated[Path | None, typer.Option("--keys")] = None,
 ) -> None:
-    """Make, show or exchange the keys by which machines know each other.
+    """Make, show or exchange keys, by which machines connect.
 
     They are needed where a node listens beyond this machine. make: keys for this machine. show: its public key, and the
     peers it lets in. allow: let a machine in, and know it when connecting to it; counts at once for nodes that run.

@@ -33,33 +33,29 @@ def label(
     output: JsonOutput,
     log: Path,  # log that the frames are of (.mcap)
     *,
-    keyframes: AtLeastOne = 8,  # how many of its labelled frames to send, where --images names no others
-    # label images NNNNNN.png (uint8 class ids), each named by the number of its frame, in place of the log's own; with
-    # a labels.json, or in the log's classes. --suggest: what is labelled already
+    keyframes: AtLeastOne = 8,  # how many labelled frames to send, where --images names none
+    # label images NNNNNN.png (class ids, 8 bits) by number of frame, with a labels.json, in place of the log's.
+    # --suggest: labelled already
     images: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    # where the finetuner listens (its option `labels`): an endpoint, or the socket folder of the launch; by default the
-    # one that runs here
+    # endpoint of the finetuner, or socket folder of the launch; by default the one that runs here
     to: Annotated[str, typer.Option(metavar="PLACE")] = "",
     suggest: Annotated[int | None, typer.Option(min=1, metavar="N")] = None,  # say which N frames to label next
-    serve: bool = False,  # open a page on this machine to paint labels on suggested frames, until Ctrl-C
-    # --serve: where labels are saved [LOG-labels, next to the log]
+    serve: bool = False,  # open a page to paint labels, until Ctrl-C
+    # --serve: where labels are saved [LOG-labels]
     out: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    # --serve: a labels.json, or a text with a class a line. Else those of the folder, of --weights, of the log, or of
-    # the weights in the package
+    # --serve: labels.json, or a class a line. Else of the folder, --weights, the log, or the package's weights
     classes: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
-    weights: Path | None = None,  # --suggest, --serve: weights whose keyframes count as labelled; also their classes
+    weights: Path | None = None,  # --suggest, --serve: whose keyframes count as labelled
     port: Port = 9092,  # --serve: of the page; 0 = any that is free
 ) -> None:
-    """Label frames of a log by hand (--serve), or say which to label (--suggest); or send labelled ones to a finetuner.
+    """Label frames of a log by hand, or say which to label.
 
-    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a
-    person paints on them, saves each stroke at once, and shows what strokes grow to. `finetune --labels DIR --strokes`
-    learns from that, without --strokes from painted pixels alone. The page is on this machine alone; to see it from
-    another one, tunnel its port.
+    --serve opens a page of this machine to paint on the frames that --suggest names: those that show most of what no
+    labelled frame shows. Strokes are saved at once; `finetune --labels DIR --strokes` learns from them.
 
-    Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
-    Frames must be in the world that the mapper maps. `semantic-mapper view --status --once --json` tells what became
-    of them, `semantic-mapper info live` which weights came of it.
+    Without these, labelled frames are sent to a running finetuner: those that together show most of the log. They must
+    be in the world that the mapper maps. `view --status --once --json` tells what became of them, `info live` which
+    weights came of it.
 
     Example: semantic-mapper label kitchen.mcap --suggest 8
     Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels

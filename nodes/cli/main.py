@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -10,42 +12,69 @@ import typer
 from typer.core import TyperGroup
 
 from semantic_mapper import __version__
+from semantic_mapper.config import nearest
 from semantic_mapper.nodes.cli.verb import Settings
 
 _MODULES = "semantic_mapper.nodes.cli"
-# By verb: the function or group of verbs (MODULE:NAME), and what it does, as its own help begins.
-VERBS: Mapping[str, tuple[str, str]] = {
-    "demo": ("demo:demo", "Map a recorded log that comes with the package: a depth camera in a furnished room."),
-    "map": ("mapping:map_", "Map a recording: a log, a film, or a folder or bag that `import` takes."),
-    "compare": ("compare:compare", "Compare two runs of one log: counts, scores, and how far the maps are apart."),
-    "up": ("up:up", "Start the nodes of a launch file as processes and watch over them until they end."),
-    "view": ("view:view", "Show a running launch, a log or a saved map in a browser, until Ctrl-C."),
-    "record": ("record:record", "Record what the nodes of a running launch publish, from outside."),
-    "calibrate": ("calibrate:calibrate", "Calibrate cameras from images of a printed ChArUco board."),
-    "import": ("importing:import_", "Make a log of a recording of another program, of a film, or of a damaged log."),
-    "info": ("info:info", "Say what a log, a map or a file of boxes holds, or which weights a mapper uses."),
-    "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
-    "merge": ("export:merge", "Make one map of several: what all have measured adds up."),
-    "query": ("query:query", "Ask a saved map, or that of a running mapper, what is where."),
-    "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),
-    "finetune": ("finetune:finetune", "Fit the field to a few labelled keyframes of a log."),
-    "autolabel": ("autolabel:autolabel", "Label every frame of a log with weights, into a new log."),
-    "label": ("label:label", "Label frames of a log by hand (--serve), or say which to label (--suggest)."),
-    "eval": (
-        "eval:evaluate",
-        "Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML.",
-    ),
-    "bench": ("bench:bench", "Measure speed on this machine, on frames of 640x480."),
-    "fleet": ("fleet:app", "Map, score, label and finetune many logs, on this machine or a Ray cluster."),
-    "keys": ("keys:keys", "Make, show or exchange the keys by which machines know each other."),
-    "doctor": ("doctor:doctor", "Look for what this machine lacks, with a fix for each thing; or list its cameras."),
+# By what a user is about: verbs, each with its function or group of verbs (MODULE:NAME) and what it does, as its own
+# help begins.
+GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "Map recordings": {
+        "demo": ("demo:demo", "Map a recorded log that comes with the package."),
+        "map": ("mapping:map_", "Map a recording: a log, a film, or what `import` takes."),
+        "import": ("importing:import_", "Make a log of a film or of a recording of another program."),
+        "eval": ("eval:evaluate", "Score logs, and results of `map`: figures, and a page."),
+        "compare": ("compare:compare", "Compare two results of one log: scores and surfaces."),
+        "fleet": ("fleet:app", "Map, score, label and finetune many logs."),
+    },
+    "Live": {
+        "calibrate": ("calibrate:calibrate", "Calibrate cameras from images of a printed ChArUco board."),
+        "up": ("up:up", "Start the nodes of a launch file, and watch over them."),
+        "view": ("view:view", "Show a running launch, a log or a saved map in a browser."),
+        "record": ("record:record", "Record what the nodes of a running launch publish."),
+    },
+    "Use a map": {
+        "query": ("query:query", "Ask a saved map, or a running mapper, what is where."),
+        "info": ("info:info", "Say what a log, a map, weights or a file of boxes holds."),
+        "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
+        "merge": ("export:merge", "Merge maps of one place into one map."),
+        "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),
+    },
+    "Teach it classes": {
+        "label": ("label:label", "Label frames of a log by hand, or say which to label."),
+        "finetune": ("finetune:finetune", "Fit weights to a few labelled keyframes of a log."),
+        "autolabel": ("autolabel:autolabel", "Label every frame of a log with weights, into a new log."),
+    },
+    "This machine": {
+        "doctor": ("doctor:doctor", "Say what this machine lacks, and the fix; list its cameras."),
+        "keys": ("keys:keys", "Make, show or exchange keys, by which machines connect."),
+        "bench": ("bench:bench", "Measure speed on this machine."),
+    },
 }
+VERBS = {name: verb for verbs in GROUPS.values() for name, verb in verbs.items()}
 # Coordinates below 0 and keys look like options.
 _FREE_ARGUMENTS = ("query", "keys")
 
 
+class _Context(typer.Context):
+    """Leaves more of a line for what options do."""
+
+    def make_formatter(self) -> Any:
+        """As of Click."""
+        formatter = super().make_formatter()
+        vars(formatter)["write_dl"] = partial(formatter.write_dl, col_max=24)
+        return formatter
+
+
 class _Group(TyperGroup):
     """Loads a verb when it is used."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """As of Click; README.md tells of --show-completion."""
+        found = super().get_params(ctx)
+        for parameter in found:
+            vars(parameter)["hidden"] = parameter.name == "show_completion"
+        return found
 
     def list_commands(self, ctx: Any) -> list[str]:
         """As of Click."""
@@ -64,13 +93,37 @@ class _Group(TyperGroup):
                 found.command(cmd_name, context_settings=settings)(function)
             command = typer.main.get_command(found)
             command.name = cmd_name
+            for each in (command, *getattr(command, "commands", {}).values()):
+                each.context_class = _Context
             self.commands[cmd_name] = command
         return self.commands[cmd_name]
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """As of Click; a typo gets the nearest verb, of those that are not loaded, too."""
+        if args[0] not in VERBS and not args[0].startswith("-"):
+            ctx.fail(f"No such command '{args[0]}'{nearest(args[0], list(VERBS))}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """As of Click; a typo in an option or in one of a few words gets the nearest that there is."""
+        try:
+            return super().invoke(ctx)
+        except typer.TyperException as error:
+            if near := vars(error).get("possibilities"):
+                vars(error)["possibilities"] = ()
+                error.message += f"; did you mean `{near[0]}`?"
+            if found := re.fullmatch(r"Value error, '(.*)' is not one of (.*)\.", error.message, re.DOTALL):
+                choices = re.findall("'([^']*)'", found[2])
+                error.message = f"'{found[1]}' is not valid{nearest(found[1], choices)}"
+            raise
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """As of Click, from what is known without loading a verb."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in VERBS.items()])
+        """As of Click, by groups, from what is known without loading a verb."""
+        formatter.write_paragraph()
+        for group, verbs in GROUPS.items():
+            formatter.write_heading(group)
+            with formatter.indentation():
+                formatter.write_dl([(f"{name:9}", text) for name, (_, text) in verbs.items()])
 
 
 app = typer.Typer(
@@ -96,11 +149,10 @@ def _options(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
-    """Posed camera frames in, live semantic 3D map out.
+    """Posed camera frames in, live semantic 3D map out. Begin with `demo`.
 
-    Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper map --help`. Results go to
-    stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 3 a map that
-    cannot be trusted (`map`), 130 Ctrl-C.
+    Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage or settings, 3 a map that cannot be trusted
+    (`map`), 130 Ctrl-C.
     """
     Settings.verbose = verbose
 

@@ -42,30 +42,26 @@ class HiddenSourceOptions(SourceOptions, frozen=True):
 @verb
 def map_(
     output: JsonOutput,
-    # Recorded log (.mcap), its parts, or a folder with them; or a film, pictures or recording that `import` takes
+    # log (.mcap), its parts, or their folder; or a film, pictures or recording
     source: list[Path],
     mapper: MapperSettings,
     options: HiddenSourceOptions,
     *,
-    out: Path | None = None,  # folder for the results; made if missing [runs/NAME]
+    out: Path | None = None,  # folder for the results [runs/NAME]
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
     rerun: Path | None = None,  # also write a Rerun recording (.rrd)
-    # corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end
-    corrections: Path | None = None,
+    corrections: Path | None = None,  # corrected poses (TUM)
     accept_untrusted: bool = False,  # exit code 0 in place of 3
     open_: bool = False,  # show the report in a browser at the end
-    view: bool = False,  # show frames and map in a browser meanwhile, and then until Ctrl-C
+    view: bool = False,  # show frames and map in a browser, until Ctrl-C
 ) -> int:
-    """Map a recording: a log, a film, or a folder or bag that `import` takes.
+    """Map a recording: a log, a film, or what `import` takes.
 
-    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, to a log in
-    OUT, with the options of `import` (--topic, --rotate, --calibration, --scale, ...).
-
-    Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
-    with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
-    Exit code 3: the map is written, but cannot be trusted; poses and depth contradict each other, or computed depth
-    is mostly at the end of its range. Exit code 4: the map is empty, or nearly so; what is said tells why.
+    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, as by
+    `import` and with its options. Bad frames are refused with the reason; the rest is mapped.
+    Ctrl-C writes the map so far (exit code 130). Exit code 3: poses and depth contradict each other, or computed depth
+    is mostly at the end of its range. Exit code 4: the map is empty, or nearly so.
 
     Example: semantic-mapper map path/to/redkitchen --open
     Example: semantic-mapper map kitchen.mcap --out runs/kitchen --weights kitchen.safetensors

@@ -25,10 +25,12 @@ from semantic_mapper.nodes.cli.verb import (
     EXIT_FAILED,
     JsonOutput,
     Remote,
+    UpOption,
     must_be_there,
     refuse_options,
     results_file,
     verb,
+    wrong_usage,
 )
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.launcher.running import map_endpoint
@@ -39,6 +41,7 @@ from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
+from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
 from semantic_mapper.replay.run_folder import map_path, prepare_file
@@ -54,13 +57,13 @@ ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correc
 @verb
 def query(
     output: JsonOutput,
-    # Saved map, folder of results, `live`, ipc://PATH or tcp://HOST:PORT
+    # saved map, folder of results, `live`, ipc://PATH or tcp://HOST:PORT
     source: Annotated[str, typer.Argument(metavar="MAP")],
     question: Question,
     remote: Remote,
     arguments: Annotated[list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [FILE]")] = None,
     *,
-    up: Up | None = None,  # instances, graph: in place of away from the floor
+    up: UpOption = "auto",
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least
     gone: bool = False,  # instances, running mapper: gone ones, too
     unsure: bool = False,  # nearest, instances: pieces that are less likely things, too
@@ -69,24 +72,23 @@ def query(
     every: AtLeastOne = 1,  # relocalize: every n-th frame
     out: Path | None = None,  # also write the answer as JSON
 ) -> int:
-    """Ask a saved map, or that of a running mapper, what is where.
+    """Ask a saved map, or a running mapper, what is where.
 
-    info: size and classes. at X Y Z: class of the surface at a point, and whether it is free, occupied or unknown.
-    nearest CLASS X Y Z: the nearest surface of a class. instances: countable things with upright boxes, how certain
-    each is (certainty) and how much of its outside was seen. graph: floors, rooms, doors, and things by room.
-
-    correct FILE moves the map of a running mapper that keeps its frames (`history.max_frames`) to corrected poses (TUM:
-    stamp tx ty tz qx qy qz qw); a pose goes to the frame nearest in time, within 5 ms. relocalize LOG finds the frames
-    of a log with measured depth in a saved map; exit code 1 where fewer than three, or not most, agree where it lies.
+    info: size and classes. at X Y Z: class at a point, and whether it is free, occupied or unknown. nearest CLASS X Y
+    Z: the nearest thing or surface of a class. instances: countable things with upright boxes, how certain each is
+    (certainty) and how much of its outside was seen. graph: floors, rooms, doors, and things by room. correct FILE:
+    move the map of a running mapper that keeps frames (`history.max_frames`) to corrected poses (TUM; within 5 ms of
+    a frame). relocalize LOG: find frames with measured depth in a saved map; exit code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
-    Example: semantic-mapper query live correct optimised.tum
     """
     name, point = _read_arguments(question, arguments or [])
-    endpoint = map_endpoint(source)
+    with wrong_usage():
+        direction, endpoint = parse_up(up), map_endpoint(source)
+    axis: Up | None = None if direction is None else tuple(direction.tolist())
     if question == "correct":
         return _correct(output, source, endpoint, Path(name), camera, remote)
     refuse_options(
@@ -105,10 +107,8 @@ def query(
     else:
         client = MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(open_saved(source))
         with client as world_map:
-            found = {
-                "map": source,
-                **answer(world_map, question, name, point, up, min_confidence, gone, unsure, picture),
-            }
+            values = (question, name, point, axis, min_confidence, gone, unsure, picture)
+            found = {"map": source, **answer(world_map, *values)}
         output.print(answer_table(found))
         if found.get("found") is False and not unsure:
             output.print("nothing is sure enough to be listed; --unsure also takes stray pieces")

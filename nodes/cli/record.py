@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-import typer
+import msgspec
 
 from semantic_mapper.config import AtLeastZero, convert_config
 from semantic_mapper.errors import ConfigError, LogError
@@ -44,22 +44,19 @@ def record(
     log: Path,  # log to write (.mcap); further parts: -1, -2, ...
     recorder: RecorderSettings,
     *,
-    launch: str = "",  # socket folder of the launch; by default the one that runs here
-    source: list[str] | None = None,  # node to record, may be repeated; by default cameras and mappers
-    topic: list[str] | None = None,  # may be repeated; by default info, frame, refused and status; or map
+    launch: str = "",  # its socket folder; by default the one that runs here
+    source: list[str] | None = None,  # node to record; repeated. By default cameras and mappers
+    topic: list[str] | None = None,  # repeated. By default info, frame, refused, status; or map
     duration: AtLeastZero = 0.0,  # seconds; 0 = to the end of the stream, or Ctrl-C
-    # colour images as JPEG of this quality; 0 = as they are, lossless
-    jpeg: Annotated[int, typer.Option(min=0, max=100)] = 0,
+    jpeg: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0,  # quality of colour images; 0 = as they are, lossless
     overwrite: OverwriteOption = False,
 ) -> int:
-    """Record what the nodes of a running launch publish, from outside.
+    """Record what the nodes of a running launch publish.
 
-    A live launch does not notice. One that plays a log in lockstep or fast waits for this reader, too: it gets no
-    faster than the disk here, and fails where this reads nothing for 30 s (lockstep: 300 s), such as after Ctrl-Z.
-
-    The log keeps the calibration and the launch's settings as attachments. Exit code 1 where something is missing,
-    such as where the disk was full; what was written is whole. A launch can also have a recorder of its own
-    (`--set recorder.enabled=true`).
+    A live launch does not notice. One that plays a log in lockstep or fast waits for this reader, too, and fails where
+    it reads nothing for 30 s (lockstep: 300 s). The log keeps the calibration and the launch's settings. Exit code 1
+    where something is missing, as where the disk was full; what was written is whole. A launch can also have a
+    recorder of its own (`up --set recorder.enabled=true`).
 
     Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from semantic_mapper.errors import EmptyMapError
 from semantic_mapper.nodes.cli.eval import print_results
-from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb
+from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb, wrong_usage
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import Launch, find_launch, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
@@ -26,7 +26,7 @@ def up(
     set_: SetOption = None,
     out: Path | None = None,  # folder for the results; the same as --set out=DIR
 ) -> None:
-    """Start the nodes of a launch file as processes and watch over them until they end.
+    """Start the nodes of a launch file, and watch over them.
 
     --set NODE.OPTION=VALUE sets an option of a node, --set NAME=VALUE one of the launch (`out`, `restart`, ...).
     Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
@@ -38,7 +38,9 @@ def up(
     Example: semantic-mapper up replay --set camera.log=kitchen.mcap --out runs/up
     Example: semantic-mapper up camera --set camera.kind=oak
     """
-    run_launch(output, load_launch(find_launch(launch), set_ or (), out))
+    with wrong_usage():
+        checked = load_launch(find_launch(launch), set_ or (), out)
+    run_launch(output, checked)
 
 
 def run_launch(output: Output, launch: Launch, on_ready: Callable[[Path], None] = lambda folder: None) -> None:

@@ -13,9 +13,10 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import structlog
@@ -33,7 +34,7 @@ from semantic_mapper.config import (
     parse_assignments,
     read_toml,
 )
-from semantic_mapper.errors import EmptyMapError, LogError, SemanticMapperError
+from semantic_mapper.errors import ConfigError, EmptyMapError, LogError, SemanticMapperError
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
@@ -52,24 +53,37 @@ LISTED = 10  # lines of one kind that are shown one by one
 _log = structlog.get_logger(__name__)
 
 ConfigT = TypeVar("ConfigT", bound=Config)
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone (docs/json.md)")]
 JsonOutput = Annotated[Output, JsonOption]  # of a verb that has this option
 WeightsOption = Annotated[
     Path | None,
     typer.Option(
         "--weights",
-        help="Weights; `rooms-computed-depth`: for cameras without depth",
+        help="Weights file, or `rooms-computed-depth`: for cameras without depth",
     ),
 ]
-MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all.")]
+MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there")]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any setting; may be repeated")
 ]
 UpOption = Annotated[
-    str, typer.Option("--up", help="Up in the world: x, -y, ..., or three numbers; auto = away from the floor.")
+    str, typer.Option("--up", metavar="AXIS", help="Up in the world: z, -y, ..., or 0,0,1; auto = away from the floor")
 ]
+
+
+class _UsageError(ConfigError):
+    """The command line, or a file of settings that it names, is wrong."""
+
+
+@contextmanager
+def wrong_usage() -> Generator[None]:
+    """Within, what cannot be a setting or an option is wrong usage (exit code 2)."""
+    try:
+        yield
+    except ConfigError as error:
+        raise _UsageError(str(error)) from error
 
 
 class Settings:
@@ -127,11 +141,13 @@ class SettingOptions:
         ]
 
     @property
+    @wrong_usage()
     def given(self) -> dict[str, Any]:
         """What the command line says, by names of settings. Raises ConfigError: ``--set`` is not of the form
-        NAME=VALUE."""
-        return self._named | parse_assignments(self._assigned)
+        NAME=VALUE, or names no setting."""
+        return self._named | parse_assignments(self._assigned, self.kind)
 
+    @wrong_usage()
     def table(self) -> dict[str, Any]:
         """File and command line together, as a TOML file would have them. Raises ConfigError: a file that is no TOML,
         or ``given`` is not."""
@@ -140,6 +156,7 @@ class SettingOptions:
             assign(data, name, value, "--set")
         return data
 
+    @wrong_usage()
     def convert(self, kind: type[ConfigT]) -> ConfigT:
         """The settings. Raises ConfigError: one that is not valid."""
         return convert_config(self.table(), kind, str(self.path or "command line"))
@@ -155,6 +172,7 @@ class MapperSettings(SettingOptions):
         "--depth": "depth.source",
     }
 
+    @wrong_usage()
     def load(self, defaults: Mapping[str, Any] | None = None) -> MapperConfig:
         """The config; see ``load_mapper_config``. Raises ConfigError: a setting that is not valid."""
         return load_mapper_config(self.path, self.given, defaults)
@@ -163,8 +181,8 @@ class MapperSettings(SettingOptions):
 class Remote(Options, frozen=True):
     """By which a verb knows a mapper on another machine."""
 
-    server: str = ""  # mapper with keys: its machine, as `semantic-mapper keys` calls it
-    keys: Path | None = None  # --server: folder of the keys, in place of this user's
+    server: str = ""  # mapper with keys: its machine, as `keys` calls it
+    keys: Path | None = None  # --server: folder of the keys
 
     def identity(self) -> ServerIdentity | None:
         """Whom to expect at the other end; None where no server is named. Raises TransportError: no keys."""
@@ -217,6 +235,8 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
                 _log.exception("failed", error=str(error))
             show_error(str(error))
             code = EXIT_EMPTY if isinstance(error, EmptyMapError) else EXIT_FAILED
+            if isinstance(error, _UsageError):
+                code = EXIT_USAGE
         except KeyboardInterrupt:
             show_error("interrupted")
             code = EXIT_INTERRUPTED
@@ -251,7 +271,9 @@ def _option(name: str, kind: Any, default: Any, text: str, *, hidden: bool = Fal
     said = "--" + name.rstrip("_").replace("_", "-")
     if without_bounds(kind)[0] is bool and default:
         said += f"/--no-{said[2:]}"
-    info = typer.Option(said, help=_sentence(text), show_default=default not in (0, "0"), hidden=hidden)
+    metavar = "<str>" if get_origin(without_bounds(kind)[0]) is list else None
+    shown = default not in (0, "0")
+    info = typer.Option(said, help=_sentence(text), show_default=shown, hidden=hidden, metavar=metavar)
     return _parameter(name, kind, info, default)
 
 

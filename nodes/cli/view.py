@@ -12,7 +12,7 @@ import rich.live
 
 from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, TransportError
-from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, WeightsOption, refuse_options, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, WeightsOption, refuse_options, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher import running
 from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
@@ -33,8 +33,8 @@ FILE_WIDTH = 140  # columns of the table where nothing says how many there are
 def view(
     output: JsonOutput,
     remote: Remote,
-    # A log (.mcap, or a folder with the parts of one), a saved map (.npz, or a folder with map.npz), the socket folder
-    # of a running launch, or where a mapper answers (tcp://...); by default the one launch that runs here
+    # log (.mcap) or folder of its parts, saved map or folder with one, socket folder of a running launch, or where a
+    # mapper answers (tcp://...); by default the one launch that runs here
     source: str = "",
     *,
     port: Port | None = None,  # of the page; 0 = any that is free [9090, or any where that is taken]
@@ -43,13 +43,12 @@ def view(
     status: bool = False,  # launch: show how its nodes are, as a table in this terminal
     once: bool = False,  # --status: show it once and end; also as --json
 ) -> None:
-    """Show a running launch, a log or a saved map in a browser, until Ctrl-C.
+    """Show a running launch, a log or a saved map in a browser.
 
-    Images, rendered semantics, depth, the camera's path, the map and stage times are shown.
-    The map has a tab for each of its colourings: class, camera colour, confidence, and age, that is, how long ago its
-    surroundings last changed while they were watched (a saved map has none). A log is mapped as by `map --view`, and
-    nothing is kept. The
-    page is served on this machine alone, and sends nothing anywhere; to see it from another one, tunnel both ports.
+    Images, rendered semantics, depth, the camera's path, the map and stage times are shown. The map has a tab for each
+    colouring: class, camera colour, confidence, and age: how long ago its surroundings last changed (a saved map has
+    none). A log is mapped as by `map --view`, and nothing is kept. The page is served on this machine alone, and sends
+    nothing anywhere; to see it from another one, tunnel both ports.
 
     With --status, twice a second: states, restarts, memory, rates, ages and losses of each node. frame: time since the
     last one; age: of the last one when it was mapped; beat: since the last sign of life. A launch on another machine is
@@ -84,9 +83,11 @@ def view(
         elif live is None:
             from semantic_mapper.replay.jobs import replay_log
 
+            with wrong_usage():
+                settings = load_mapper_config(config)
             results = Path(stack.enter_context(TemporaryDirectory(prefix="semantic-mapper-view-")))
             with frame_progress("map", None, stop=stop) as bar:
-                replay_log(path, results, weights, load_mapper_config(config), watch=page.watch, monitor=bar)
+                replay_log(path, results, weights, settings, watch=page.watch, monitor=bar)
         else:
             from semantic_mapper.nodes.viewer.sources import REFRESH_S, show_live
 

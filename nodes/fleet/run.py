@@ -134,7 +134,7 @@ def make_task(
     """
     found = OPERATIONS[operation]
     given = {} if config is None else read_toml(config)
-    for name, value in parse_assignments(assignments).items():
+    for name, value in parse_assignments(assignments, found.settings).items():
         assign(given, name, value, "--set")
     data = copy.deepcopy(given)
     for name, value in found.defaults.items():

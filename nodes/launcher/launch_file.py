@@ -110,7 +110,7 @@ def find_launch(path: Path) -> Path:
     name = path.name.removesuffix(".toml")
     if path.parent != Path() or name not in files:
         what = "is a folder" if path.is_dir() else "no such file"
-        raise ConfigError(f"{path}: {what}; launch files that come with the package: {', '.join(files)}")
+        raise ConfigError(f"{path}: {what}, and no launch file of the package{nearest(name, list(files))}")
     return files[name]
 
 

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import scipy  # loads `spatial` when it is first used
 
+from semantic_mapper.config import nearest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
@@ -54,9 +55,8 @@ def choose_format(path: Path, given: str | None, suffixes: dict[str, Name], form
     for name in formats:
         if name == wanted:
             return name
-    raise ConfigError(
-        f"{path}: which format is that? The name may end in {' '.join(suffixes)}, or give --format {'|'.join(formats)}"
-    )
+    hint = nearest(path.suffix.lower(), list(suffixes))
+    raise ConfigError(f"{path}: its ending names no format of --format {'|'.join(formats)}{hint}")
 
 
 def encoded(rgb: UInt8) -> EncodedImage:

@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from semantic_mapper.config import Config, to_plain
+from semantic_mapper.config import Config, nearest, to_plain
 from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.files import write_bytes
@@ -189,10 +189,8 @@ def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():
-        raise WeightsError(
-            f"{path}: no such weights file; check the path, or make one with `semantic-mapper finetune` (to refine "
-            f"maps `semantic-mapper-research train --kind {MAP_KIND}`)"
-        )
+        named = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
+        raise WeightsError(f"{path}: no such weights file, nor weights of the package{nearest(path.name, named)}")
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})

@@ -69,8 +69,7 @@ class PanopticFitConfig(Config, frozen=True):
 class FinetuneConfig(Config, frozen=True):
     """Budget of a fit, and what it learns."""
 
-    # Wall-clock budget of all of it, looks at held-out rays included; 0 = only steps count (then a run repeats bit for
-    # bit). The first look is made in any case.
+    # wall-clock budget; 0 = only steps count, and a run repeats bit for bit
     seconds: AtLeastZero = 300.0
     steps: NotNegative = 0  # step budget; 0 = only seconds count
     width: AtLeastOne = 320  # working width of the images

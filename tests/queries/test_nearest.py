@@ -71,3 +71,5 @@ def test_a_class_that_is_nowhere() -> None:
     assert nearest(whole(), "cup", (0, 0, 0), 1.0) is None
     with pytest.raises(MapError, match="min_confidence"):
         nearest(whole(), "cup", (0, 0, 0), 1.5)
+    with pytest.raises(LabelError, match=r"no class 'lmap'; did you mean `lamp`"):
+        nearest(whole(), "lmap", (0, 0, 0))

@@ -151,7 +151,7 @@ def test_a_field_of_a_scene_labels_its_log_and_maps_it(log: Path, config: Path, 
     [
         ("--kind irt", "how many labelled frames?"),
         ("--kind grid --keyframes 2", "learns from no keyframes"),
-        ("--kind sray --keyframes 2", "is not one of 'irt', 'panoptic', 'grid'"),
+        ("--kind sray --keyframes 2", "'sray' is not valid; there are irt, panoptic, grid"),
         ("--kind grid --weights x", "starts from nothing"),
         ("--kind panoptic", "--kind panoptic and --boxes FILE go together"),
         ("--boxes x.json --keyframes 2", "--kind panoptic and --boxes FILE go together"),

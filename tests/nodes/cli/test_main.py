@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from typer.testing import CliRunner
 
 from semantic_mapper import __version__
+from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.main import VERBS
 from tests.contract import entry_points as api
 from tests.nodes.support import refused, run_ok
@@ -17,10 +19,39 @@ def test_help_lists_all_verbs_and_each_explains_itself_with_an_example() -> None
     assert [word for word in codes.replace(",", " ").split() if word.isdigit()] == ["0", "1", "2", "3", "130"]
     for name, (_, text) in VERBS.items():
         verb = api.verb_of(name)
-        assert f"  {name} " in listed and " ".join((verb.help or "").split()).startswith(text.rstrip(".")), name
-        if not hasattr(verb, "commands"):
-            shown = run_ok(name, "--help")
-            assert f"Example: semantic-mapper {name}" in shown.stdout and not shown.stderr
+        assert f"  {name} " in listed and f"{text}\n" in listed, name
+        assert " ".join((verb.help or "").split()).startswith(text.rstrip(".")), name
+
+
+def test_help_has_an_example_and_at_most_40_lines() -> None:
+    groups = {name: getattr(api.verb_of(name), "commands", ()) for name in VERBS}
+    for words in ("", *groups, *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)):
+        for columns in (80, 110):
+            shown = CliRunner().invoke(cli.app, [*words.split(), "--help"], terminal_width=columns - 2).output
+            assert len(shown.splitlines()) <= 40, f"{words} at {columns} columns"
+            assert f"Example: semantic-mapper {words}" in shown or not words or groups.get(words), words
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("mpa room.mcap", "map"),
+        ("map room.mcap --voxelsize 1", "--voxel-size"),
+        ("map room.mcap --quality fsat", "fast"),
+        (f"map {__file__} --set voxelmap.voxel_size_m=1", "voxel_map.voxel_size_m"),
+        (f"map {__file__} --set voxel_size_m=1", "voxel_map.voxel_size_m"),
+        ("query map.npz nearst wall 0 0 1", "nearest"),
+        (f"finetune {__file__} --keyframes 4 --out w --set sedd=1", "seed"),
+        ("up camra", "camera"),
+        ("up camera --set camera.knd=oak", "kind"),
+        ("import src dst --format polycan", "polycam"),
+        ("export map.npz --out map.gbl", ".glb"),
+        ("fleet rnu x", "run"),
+        ("doctor --cameras --kind v4l", "v4l2"),
+    ],
+)
+def test_a_typo_names_the_nearest(words: str, meant: str) -> None:
+    assert refused(*words.split(), code=2).replace("'", "`").endswith(f"id you mean `{meant}`?")
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,18 @@ from tests.nodes.support import (
 from tests.small import tiny_frames
 
 
+def test_missing_weights_unknown_settings_and_bad_corrections_are_named(log: Path, tmp_path: Path) -> None:
+    wrong, corrections = tmp_path / "wrong.toml", tmp_path / "corrections.txt"
+    wrong.write_text("[voxel_map]\nvoxel_sise_m = 0.05\n")
+    corrections.write_text("no trajectory\n")
+    for option, file, code, said in (
+        ("--weights", "rooms-poeple", 1, "did you mean `rooms-people`?"),
+        ("--config", wrong, 2, "did you mean `voxel_size_m`?"),
+        ("--corrections", corrections, 1, "corrections.txt: holds no pose"),
+    ):
+        assert said in refused("map", log, "--out", tmp_path / "out", option, file, code=code)
+
+
 def test_bad_and_damaged_frames_are_named_and_the_rest_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
     frames = list(tiny_frames(6))
     skewed = frames[1].T_world_camera.copy()

@@ -47,7 +47,7 @@ def test_questions_are_answered_in_numbers_and_in_words(map_file: Path, tmp_path
     found, shown = ask(map_file, "nearest", "cup", *(BALL + np.array([0.0, 0.0, 1.0])))
     assert found["found"] and abs(found["distance_m"] - (1.0 - RADIUS)) < 0.006 and "cup" in shown
     assert ask(map_file, "nearest", "lamp", 0, 0, 0)[0]["found"] is False
-    found, shown = ask(map_file, "instances", "--up", "0", "0", "-1")
+    found, shown = ask(map_file, "instances", "--up", "-z")
     large = {thing["class"]: thing for thing in found["instances"] if thing["voxels"] > 200}
     assert set(large) == {"table", "cup"} and "certainty" in shown
     np.testing.assert_allclose(large["table"]["box"]["center"], BOX, atol=0.03)
@@ -71,7 +71,7 @@ def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
         ("floor, table, cup, lamp", ("query", map_file, "nearest", "kettle", "0", "0", "0")),
         ("row 0", ("query", map_file, "at", "nan", "0", "0")),
         ("no such map file", ("query", tmp_path / "none.npz", "info")),
-        ("no floor was found", ("query", map_file, "graph", "--up", "1", "0", "0", "--picture", picture)),
+        ("no floor was found", ("query", map_file, "graph", "--up", "x", "--picture", picture)),
         ("a saved map keeps no frames to correct", ("query", map_file.parent, "correct", map_file)),
         ("is a map alone; give the folder", ("eval", map_file)),
     ):

@@ -229,7 +229,7 @@ def test_files_that_are_there_come_before_those_of_the_package(tmp_path: Path, m
     (tmp_path / "replay.toml").touch()
     assert find_launch(Path("replay.toml")) == Path("replay.toml")
     for name in ("replai", "elsewhere/replay", "../replay"):
-        with pytest.raises(ConfigError, match=r"no such file; launch files that come with the package: .*replay"):
+        with pytest.raises(ConfigError, match=r"no such file, and no launch file of the package; .*replay"):
             find_launch(Path(name))
     with pytest.raises(ConfigError, match="no node of kind 'camera'"):
         load_launch(file_of(tmp_path, "node = []"))

@@ -101,7 +101,7 @@ def client() -> Iterator[MapClient]:
 def test_a_bad_or_too_long_question_is_an_error_as_in_process(client: MapClient) -> None:
     many = np.zeros((60000, 3))
     for ask, error, said in (
-        (lambda: client.nearest("kettle", (0, 0, 0)), LabelError, "no class 'kettle'; it has floor, table, cup, lamp"),
+        (lambda: client.nearest("kettle", (0, 0, 0)), LabelError, "It has floor, table, cup, lamp"),
         (lambda: client.at([(0, 0, 0), (np.nan, 0, 0)]), MapError, "row 1 is"),
         (lambda: client.cast_rays((0, 0, 0), (0, 0, 0)), MapError, "a direction must have"),
         (lambda: client.cast_rays(PLACES[:2], PLACES[:3] + 1), MapError, "2 origins and 3 directions"),
