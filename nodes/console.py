@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 import structlog
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.segment import Segment
@@ -80,7 +81,7 @@ class Output:
         else:  # a pipe gets columns, without lines round them or blanks behind them
             for thing in things:
                 if isinstance(thing, Table):
-                    thing.box, thing.pad_edge = None, False
+                    thing.box, thing.pad_edge, thing.padding = None, False, (0, 2, 0, 0)
             with self.console.capture() as printed:
                 self.console.print(*things, soft_wrap=True)
             self._stream.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
@@ -115,12 +116,17 @@ def table(
     numbers: Collection[str] = (),
 ) -> Table:
     """A table for ``Output.print``, of cells (None is an empty one), names of the columns (without any the first column
-    names the rows), and which of these are of ``numbers``, that end at the right."""
-    found = Table(title=title, caption=caption, title_justify="left", show_header=bool(names))
-    for name in names:
-        found.add_column(name, justify="right" if name in numbers else "left", overflow="fold")
-    for row in rows:
-        found.add_row(*("" if cell is None else cell if isinstance(cell, Text) else str(cell) for cell in row))
+    names the rows), and which of these are of ``numbers``, that end at the right. Named columns whose cells are all
+    empty are left out."""
+    found = Table(title=title, caption=caption, title_justify="left", show_header=bool(names), box=SIMPLE_HEAD)
+    found.show_edge, found.pad_edge, found.padding = False, False, (0, 1, 0, 0)
+    cells = [["" if cell is None else cell if isinstance(cell, Text) else str(cell) for cell in row] for row in rows]
+    shown = [not cells or any(row[i] for row in cells) for i in range(max(len(names), *map(len, cells), 0))]
+    for name, is_shown in zip(names, shown, strict=False):
+        if is_shown:
+            found.add_column(name, justify="right" if name in numbers else "left", overflow="fold")
+    for row in cells:
+        found.add_row(*(cell for cell, is_shown in zip(row, shown, strict=True) if is_shown or not names))
     return found
 
 

@@ -64,7 +64,8 @@ def figures_table(
         found = [dig(record, path) or {} for record in records.values()]
         table.add_section()
         for name in dict.fromkeys(name for values in found for name in values):
-            add(f"{head} {name}", [values.get(name) for values in found], show)
+            shown = name.replace("_", " ") if head.endswith(":") else name  # no class is renamed
+            add(f"{head} {shown}", [values.get(name) for values in found], show)
     return table
 
 
@@ -219,7 +220,7 @@ _ROWS: Sequence[tuple[str, str, Callable[[Any], str]]] = (
     ("mIoU of the map", "metrics.map_miou", percent),
 )
 _ROWS_BY_NAME: Sequence[tuple[str, str, Callable[[Any], str]]] = (
-    ("frames", "frames", str),
+    ("frames:", "frames", str),
     ("stage p50, p95:", "stages_ms", _stage),
     ("IoU", "metrics.per_class", percent),
 )

@@ -18,8 +18,9 @@ from semantic_mapper.nodes.cli.verb import (
     EXIT_FAILED,
     EXIT_USAGE,
     JsonOutput,
-    SetOption,
     Settings,
+    complete,
+    set_option,
     show_error,
     verb,
     wrong_usage,
@@ -32,6 +33,7 @@ from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
+from semantic_mapper.setting_docs import settings_of
 
 MAX_SHOWN = 500  # rows that are printed
 MAX_LOGS = 40
@@ -41,6 +43,13 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Map, score, label and finetune many logs. On this machine, or a Ray cluster (docs/fleet.md).",
 )
+
+
+def _settings(ctx: typer.Context, incomplete: str) -> list[str]:
+    from semantic_mapper.nodes.fleet.run import OPERATIONS
+
+    kind = OPERATIONS.get("".join(ctx.args[:1]))
+    return complete(settings_of(kind.settings), incomplete) if kind else []
 
 
 @app.command()
@@ -54,7 +63,7 @@ def run(
     *,
     out: str,  # folder or URL for the results
     weights: str | None = None,  # file, URL, or name of weights in the package; without it those of the verb
-    settings: SetOption = None,
+    settings: Annotated[list[str] | None, set_option(_settings)] = None,
     config: Path | None = None,  # TOML file with settings; --set goes before it
     address: str | None = None,  # HOST:PORT of a Ray cluster to join; without it Ray starts here, on loopback only
     cpus: Annotated[float, msgspec.Meta(ge=0.1)] = 1.0,  # CPUs of a task

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,8 +36,8 @@ BOX_FILES = (".json", ".xml")
 @verb
 def info(
     output: JsonOutput,
-    # Recorded log (.mcap), its parts or their folder; saved map, or a folder with map.npz; boxes.json, JSON of `query
-    # MAP instances`, or XML of KITTI-360; `live`, ipc://PATH or tcp://HOST:PORT of a mapper
+    # log (.mcap), its parts or their folder; saved map, or a folder with one; weights (.safetensors); boxes.json, JSON
+    # of `query MAP instances`, or XML of KITTI-360; `live`, ipc://PATH or tcp://HOST:PORT of a mapper
     file: list[str],
     remote: Remote,
     *,
@@ -62,6 +63,8 @@ def info(
         raise typer.BadParameter("go together, with a file of boxes", param_hint="--picture and --out")
     if boxes:
         found = _boxes_info(output, path, picture, out)
+    elif path.suffix == ".safetensors":
+        found = _weights_file_info(output, path)
     elif endpoint := map_endpoint(file[0]):
         found = _weights_info(output, endpoint, remote)
     elif is_map(path):
@@ -244,6 +247,35 @@ def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, An
     counts = f"{counted(state.taken, 'time')} taken, {state.refused} refused, {state.rolled_back} rolled back"
     output.print(table(rows, names, title=f"weights {state.in_use} in use; {counts}"))
     return to_builtins(state)
+
+
+def _weights_file_info(output: Output, path: Path) -> dict[str, Any]:
+    """What a file of weights says of itself."""
+    from semantic_mapper.fields.checkpoint import open_weights, refusing_damage, unpack_label_set
+
+    _, metadata = open_weights(path)
+    with refusing_damage(path):
+        labels, recipe = unpack_label_set(metadata["label_set"]), dict(json.loads(metadata["recipe"]))
+    found = {
+        "weights": str(path),
+        "kind": metadata["field"],
+        "size_bytes": path.stat().st_size,
+        "label_set": {"name": labels.name, "ids": list(labels.ids), "classes": list(labels.names)},
+        "train_frames": len(recipe.get("train_stamps_ns", ())),
+        "recipe": recipe,
+    }
+    named = {"made by": "kind", "steps": "steps", "seconds": "seconds", "version": "version", "suite": "suite"}
+    rows = [
+        ("kind", found["kind"]),
+        ("size", f"{found['size_bytes'] / 1e6:.1f} MB"),
+        ("classes", f"{labels.name}: {', '.join(labels.names)}"),
+        ("keyframes", found["train_frames"] or "none of a log"),
+        *((name, recipe[key]) for name, key in named.items() if key in recipe),
+    ]
+    for name, key in (("accuracy held out", "held_out_accuracy"), ("mIoU of validation", "validation_miou")):
+        rows += [(name, f"{recipe[key] * 100:.1f} %")] if recipe.get(key) is not None else []
+    output.print(table(rows, title=str(path)))
+    return found
 
 
 def _boxes_info(output: Output, file: Path, picture: Path | None, out: Path | None) -> dict[str, Any]:

@@ -5,25 +5,48 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated
 
-from semantic_mapper.errors import EmptyMapError
+import typer
+
+from semantic_mapper.config import load_config
+from semantic_mapper.errors import EmptyMapError, LogError, SemanticMapperError
 from semantic_mapper.nodes.cli.eval import print_results
-from semantic_mapper.nodes.cli.verb import SetOption, must_be_there, verb, wrong_usage
+from semantic_mapper.nodes.cli.verb import complete, must_be_there, set_option, verb, wrong_usage
 from semantic_mapper.nodes.console import Output
-from semantic_mapper.nodes.launcher.launch_file import Launch, find_launch, load_launch
+from semantic_mapper.nodes.launcher.launch_file import Launch, LaunchFile, find_launch, launch_files, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
-from semantic_mapper.nodes.options import CameraOptions, MapperOptions
+from semantic_mapper.nodes.options import OPTIONS, CameraOptions, LiveCamera, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import hold_folder
+from semantic_mapper.setting_docs import settings_of
+
+
+def _launches(incomplete: str) -> list[str]:
+    return [name for name in launch_files() if name.startswith(incomplete)]
+
+
+def _settings(ctx: typer.Context, incomplete: str) -> list[str]:
+    """What ``--set`` of the launch that is named may be; nothing where it cannot be read."""
+    try:
+        file = load_config(find_launch(Path("".join(ctx.args[:1]))), LaunchFile)
+    except SemanticMapperError:
+        return []
+    found = [setting for setting in settings_of(LaunchFile) if setting.name != "node"]
+    for node in file.node:
+        for kind in (OPTIONS[node.kind], *((LiveCamera,) if node.kind == "camera" else ())):
+            found += settings_of(kind, f"{node.name}.")
+    return complete(found, incomplete)
 
 
 @verb
 def up(
     output: Output,
-    launch: Path,  # launch file, or the name of one of the package: camera, replay, ...; an unknown name lists all
+    # launch file, or the name of one of the package: camera, replay, ...; an unknown name lists all
+    launch: Annotated[Path, typer.Argument(autocompletion=_launches)],
     *,
-    set_: SetOption = None,
+    set_: Annotated[list[str] | None, set_option(_settings)] = None,
     out: Path | None = None,  # folder for the results; the same as --set out=DIR
 ) -> None:
     """Start the nodes of a launch file, and watch over them.

@@ -13,10 +13,10 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import structlog
@@ -38,7 +38,14 @@ from semantic_mapper.errors import ConfigError, EmptyMapError, LogError, Semanti
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
-from semantic_mapper.setting_docs import BOUNDLESS, comments_of, comments_of_parameters, settings_of, without_bounds
+from semantic_mapper.setting_docs import (
+    BOUNDLESS,
+    Setting,
+    comments_of,
+    comments_of_parameters,
+    settings_of,
+    without_bounds,
+)
 
 if TYPE_CHECKING:
     from semantic_mapper.transport.keys import ServerIdentity
@@ -65,9 +72,27 @@ WeightsOption = Annotated[
 MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there")]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any setting; may be repeated")
-]
+
+
+def set_option(completed: Callable[..., list[str]]) -> Any:
+    """The option ``--set``, and what a shell completes it with."""
+    return typer.Option("--set", metavar="NAME=VALUE", help="Any setting; may be repeated", autocompletion=completed)
+
+
+def complete(settings: Iterable[Setting], incomplete: str) -> list[str]:
+    """NAME=VALUE of settings that begin so, with each value that is possible, else with the default."""
+    found: list[str] = []
+    for setting in settings:
+        is_plain = isinstance(setting.default, int | float | str)
+        values = [setting.default] if is_plain else [""]
+        if get_origin(setting.type) is Literal:
+            values = get_args(setting.type)
+        elif setting.type is bool:
+            values = ("true", "false")
+        found += [f"{setting.name}={value}" for value in values]
+    return [text for text in found if text.startswith(incomplete)]
+
+
 UpOption = Annotated[
     str, typer.Option("--up", metavar="AXIS", help="Up in the world: z, -y, ..., or 0,0,1; auto = away from the floor")
 ]
@@ -133,11 +158,12 @@ class SettingOptions:
             info = typer.Option(option, help=f"{_sentence(setting.text)}  [default: {default}]", show_default=False)
             bounded = Annotated[setting.type, msgspec.Meta(ge=setting.low, le=setting.high)]
             found.append(_parameter(_parameter_name(option), bounded, info, None))
+        completed = set_option(lambda incomplete: complete(settings_of(cls.kind), incomplete))
         listed = typer.Option("--config", help="TOML file of settings (docs/settings.md)")
         return [
             *found,
             _parameter("config", Path | None, listed, None),
-            _parameter("set", SetOption, typer.Option(), None),
+            _parameter("set", list[str], completed, None),
         ]
 
     @property

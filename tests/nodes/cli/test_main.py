@@ -54,6 +54,20 @@ def test_a_typo_names_the_nearest(words: str, meant: str) -> None:
     assert refused(*words.split(), code=2).replace("'", "`").endswith(f"id you mean `{meant}`?")
 
 
+def test_a_shell_completes_settings_their_values_and_launches() -> None:
+    for words, found in (
+        ("ma", ["map"]),
+        ("map x --quality fa", ["fast"]),
+        ("map x --set quality=f", ["quality=fast"]),
+        ("fleet run map x --set voxel_map.vox", ["voxel_map.voxel_size_m=0.02"]),
+        ("up cam", ["camera"]),
+        ("up camera --set camera.ki", ["camera.kind="]),
+    ):
+        told = {"COMP_WORDS": f"semantic-mapper {words}", "COMP_CWORD": str(len(words.split()))}
+        env = {**told, "_SEMANTIC_MAPPER_COMPLETE": "complete_bash"}
+        assert CliRunner().invoke(cli.app, prog_name="semantic-mapper", env=env).output.split() == found, words
+
+
 @pytest.mark.parametrize(
     "words",
     [
