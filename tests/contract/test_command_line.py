@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import enum
 import json
+import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -22,11 +24,8 @@ COMMANDS: dict[str, str] = {
     "help of a verb": "map --help",
     "unknown verb": "fly",
     "unknown option": "info {log} --colour",
-    "info of a log": "info {log}",
     "info of a log as JSON": "info {log} --json",
-    "info of a map": "info {map}",
     "info of a map as JSON": "info {map} --json",
-    "info of a folder of results": "info {stored}",
     "info of nothing": "info {tmp}/none.mcap",
     "info of a damaged log": "info {damaged}",
     "info without a file": "info",
@@ -208,6 +207,33 @@ def test_exit_codes_and_json_are_those_of_then(names: list[str], tmp_path: Path)
     then = {name: _GOLDEN["codes"][name] for name in names if name in _GOLDEN["codes"]}
     assert {n: codes[n] for n in then if codes[n] != then[n]} == {}, then
     assert lacking({n: f for n, f in _GOLDEN["json"].items() if n in names}, forms) == []
+
+
+def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
+    """Places of a form, and what is there as docs/json.md calls it; nothing of an empty list."""
+    inner = value.items() if isinstance(value, dict) else [("[]", item) for item in value]
+    for name, item in inner:
+        at = f"{place}.{name}".lstrip(".").replace(".[]", "[]")
+        if isinstance(item, str):
+            found = {"str": "text", "float": "number", "NoneType": "null"}.get(item, item)
+            yield at.rstrip("[]"), f"{'[' * at.count('[]', len(at.rstrip('[]')))}{found}"
+        else:
+            yield from _leaves(item, at)
+
+
+def test_the_page_of_json_has_each_field_with_its_type() -> None:
+    page = (api.REPOSITORY / "docs" / "json.md").read_text(encoding="utf-8")
+    for command, found in _GOLDEN["json"].items():
+        section = page.partition(f"\n## {command.split()[0]}\n")[2].partition("\n## ")[0]
+        rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
+        said = {re.escape(name).replace("NAME", r"[^.]+"): row[1] for row in rows for name in row[0].split(", ")}
+        for place, kind in _leaves(found):
+            told = [
+                t
+                for n, t in said.items()
+                if re.fullmatch(n + r"\..*" * ("table" in t), place) or re.fullmatch(n, place)
+            ]
+            assert any("table" in t or kind in t for t in told), f"{command}: {place} is {kind}, the page says {told}"
 
 
 def test_every_command_of_then_is_run() -> None:

@@ -48,7 +48,7 @@ def long_log(folder: Path) -> Path:
 
 
 def test_recorder_keeps_every_frame_byte_for_byte_and_what_exists(log: Path, up: Up, out: Path) -> None:
-    assert "frames fused" in run_ok(*up(log, RECORD)).stdout
+    assert "frames: fused" in run_ok(*up(log, RECORD)).stdout
     with LogReader(log) as before, LogReader(out / "recorded.mcap") as after:
         assert [p for _, p in after.frame_parts()] == [p for _, p in before.frame_parts()]
         assert after.info.label_set == before.info.label_set

@@ -122,7 +122,7 @@ def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> N
     shown = cells(page)
     assert shown["coverage"] == ["50.0 %", "25.0 %"] and shown["IoU floor"] == ["-", "-"]
     assert "S-Ray is below U-Net" in "".join(page.itertext())
-    assert len(shown["frames fused"]) == 2
+    assert len(shown["frames: fused"]) == 2
     assert len(pictures(page)) == 1, "the overview that is there"
 
 
