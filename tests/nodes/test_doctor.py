@@ -25,4 +25,4 @@ def test_cameras_are_listed_as_a_table_and_as_json() -> None:
     assert set(found) == {"cameras", "unknown"} and found["unknown"] == {}
     table = run("doctor", "--cameras", "--kind", "v4l2")
     assert all(c["address"] in table.stdout for c in found["cameras"]) or "no camera is connected" in table.stdout
-    assert "did you mean `v4l2`?" in refused("doctor", "--cameras", "--kind", "v4l")
+    assert "did you mean `v4l2`?" in refused("doctor", "--cameras", "--kind", "v4l", code=2)

@@ -79,7 +79,7 @@ def test_a_replay_leaves_a_report_with_its_figures_and_pictures(run: Path) -> No
     page, summary = read_page(run / "report.html"), json.loads((run / "summary.json").read_text())
     assert page.findtext("body/h1") == "Replay of <room> & hall"
     shown = cells(page)
-    assert shown["frames refused"] == ["1"] and shown["frames scored"] == ["3"]
+    assert shown["frames: refused"] == ["1"] and shown["frames: scored"] == ["3"]
     assert shown["mIoU"] == [f"{summary['metrics']['miou'] * 100:.1f} %"]
     assert shown["3"] == ["77", "a pose that is no <pose>"]
     assert shown["stage p50, p95: fuse"] == ["{p50:.2f}, {p95:.2f} ms".format(**summary["stages_ms"]["fuse"])]

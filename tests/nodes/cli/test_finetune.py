@@ -43,6 +43,7 @@ def test_finetuned_weights_remember_their_keyframes_and_those_before(log: Path, 
     assert len(checkpoint.train_stamps_ns) == len(checkpoint.anchors) == 3
     assert checkpoint.train_stamps_ns <= {f.stamp_ns for f in tiny_frames(6)}
     assert (checkpoint.recipe["source"], checkpoint.recipe["steps"]) == ("room.mcap", 2)
+    assert json.loads(run_ok("info", tuned, "--json").stdout)["train_frames"] == 3
     arguments = ("--keyframes", "2", "--seed", "5", "--seconds", "0", "--steps", "1", "--weights", tuned)
     run_ok("finetune", log, *arguments, "--out", out)
     again = load_checkpoint(out)
