@@ -76,7 +76,7 @@ wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check t
 	.venv/bin/python -m tools.wheels
 
 docs: $(READY)  ## build the site of all pages into dist/docs/; broken links are errors
-	.venv/bin/python -m sphinx -c docs -b html -q -W --keep-going . dist/docs
+	.venv/bin/python -m sphinx -c docs -b html -q -E -W --keep-going . dist/docs
 	@echo "open dist/docs/README.html"
 
 format: $(READY)  ## format and fix what can be fixed automatically

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from sphinx.application import Sphinx
 
 import semantic_mapper
@@ -21,13 +23,11 @@ html_show_copyright = html_show_sourcelink = html_copy_source = False
 html_title = f"semantic-mapper {version}"
 
 # Page -> what the menu shows below it, by captions. Forges show pages as they are, so they do not hold this.
-_HOW_TO = ["recordings", "cameras", "robots", "scenes", "fleet"]
+_HOW_TO = [f"docs/{name}" for name in ("recordings", "cameras", "robots", "scenes", "fleet")]
+_PROJECT = ["docs/architecture", "docs/decisions/README", "research/docs/experiments", "CONTRIBUTING"]
+_REST = sorted({f"docs/{page.stem}" for page in Path(__file__).parent.glob("*.md")} - {*_HOW_TO, *_PROJECT})
 MENU = {
-    "README": {
-        "How to": [f"docs/{name}" for name in _HOW_TO],
-        "Reference": ["docs/layouts", "docs/settings", "docs/python", "docs/model-card", "CHANGELOG"],
-        "The project": ["docs/architecture", "docs/decisions/README", "research/docs/experiments", "CONTRIBUTING"],
-    },
+    "README": {"How to": _HOW_TO, "Reference": ["docs/python", *_REST, "CHANGELOG"], "The project": _PROJECT},
     "docs/robots": {"Examples": ["examples/robot/README"]},
     "docs/decisions/README": {"Decisions": ["docs/decisions/0*", "research/docs/decisions/0*"]},
     "research/docs/experiments": {"Research": ["research/docs/[!e]*"]},
