@@ -24,7 +24,7 @@ from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
-from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
+from semantic_mapper.replay.sfm.scale import ScaleHint
 
 _STAGES = {
     "look": "look through the film",
@@ -42,7 +42,6 @@ class SourceOptions(Options, frozen=True):
     calibration: Path | None = None  # film: the camera's file, of `calibrate`
     focal_prior: AtLeastZero = 0.0  # film: focal length, some pixels
     scale: AtLeastZero = 0.0  # metres per unit of poses without a scale
-    distance: str = ""  # film: "SECONDS:U,V SECONDS:U,V METRES"
     square_mm: AtLeastZero = 0.0  # film: side of a board's square in it
     camera_height: AtLeastZero = 0.0  # film: over the floor, metres
     # bags: ROLE=NAME (image, depth, info, depth_info, pose); repeated. depth=none (any format): without depth
@@ -64,11 +63,10 @@ class SourceOptions(Options, frozen=True):
         """As the import of films takes them. Raises ConfigError: values that cannot be, or that exclude each other."""
         if self.topic or self.world or self.body:
             raise ConfigError("a film has no topics and no frames; --topic, --world and --body are for recordings")
-        if sum(map(bool, (self.scale, self.distance, self.square_mm, self.camera_height))) > 1:
+        if sum(map(bool, (self.scale, self.square_mm, self.camera_height))) > 1:
             raise ConfigError("the scale comes from one source only: leave out all but one of the options that say it")
         hint = ScaleHint(
             factor=self.scale or None,
-            distance=parse_distance(self.distance) if self.distance else None,
             board=board_settings(None, self.square_mm).board if self.square_mm else None,
             camera_height_m=self.camera_height or None,
         )
@@ -78,7 +76,7 @@ class SourceOptions(Options, frozen=True):
         """``options`` with what these say of a recording. Raises typer.BadParameter: some are for films alone."""
         if msgspec.structs.replace(self, scale=0.0, rotate="0", topic=None, world="", body="").given:
             raise typer.BadParameter(
-                "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, "
+                "the recording has poses and intrinsics of its own; --calibration, --focal-prior, "
                 "--square-mm and --camera-height are for films"
             )
         topics, scale = _topics_by_role(self.topic or []), self.scale or None
@@ -105,8 +103,8 @@ def import_(
     """Make a log of a film or of a recording of another program.
 
     Frames that cannot be used are left out, with the reason. Poses of a film or a folder of pictures are found; its
-    lengths are metres by GPS of the pictures or by one of --scale, --distance, --square-mm, --camera-height. Of a
-    damaged log every intact message is kept. See docs/layouts.md.
+    lengths are metres by GPS of the pictures or by one of --scale, --square-mm, --camera-height, or later by `scale`.
+    Of a damaged log every intact message is kept. See docs/layouts.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
     Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5

@@ -88,13 +88,13 @@ def parse_up(text: str) -> Float64 | None:
     """``auto`` (None), an axis of the world (x, -y, ...), or three numbers. Raises ConfigError: none of these."""
     if text == "auto":
         return None
-    direction = AXES[text] if text in AXES else _numbers(text)
+    direction = AXES[text] if text in AXES else parse_numbers(text)
     if direction is None or direction.shape != (3,) or not direction.any():
         raise ConfigError(f"--up {text}: give auto, one of {' '.join(AXES)}, or three numbers such as '0 -1 0.2'")
     return direction / np.linalg.norm(direction)
 
 
-def _numbers(text: str) -> Float64 | None:
+def parse_numbers(text: str) -> Float64 | None:
     """Finite numbers, with spaces or commas between them; None where it is something else."""
     try:
         numbers = np.array(text.replace(",", " ").split(), np.float64)

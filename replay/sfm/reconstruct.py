@@ -18,7 +18,7 @@ from semantic_mapper.drivers.calibration import Rectifier, load_calibration
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.geometry import camera_matrix, scale_intrinsics, transform
+from semantic_mapper.geometry import scale_intrinsics, transform
 from semantic_mapper.imaging import rotate_intrinsics
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.format import atomic_log
@@ -38,21 +38,19 @@ from semantic_mapper.replay.sfm.film import (
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps
 from semantic_mapper.replay.sfm.scale import (
     MIN_BOARD_CORNERS,
-    NEIGHBOURS,
     UNSCALED_DEPTH_M,
-    Mark,
     ScaleHint,
     find_edges,
-    marked_place,
     median_depth,
     scale_by_board,
+    scale_by_floor,
     scene_depth,
     upright,
     vertical,
 )
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics, Float64, Int64, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float64, Int64, PosedFrame, UInt8
 
 FOCAL_PRIORS = (0.85, 1.2, 0.65)  # of the longer side, in the order of trial: phones, webcams, wide lenses
 RETRY_PRIORS = (1.0, 0.85, 1.2)  # of the focal length that was given as a guess
@@ -65,7 +63,6 @@ EDGE_FRAMES = 60  # about as many are searched for upright edges
 PACKING = CodecOptions(rgb="jpeg", jpeg_quality=95)  # a film has lost more already
 
 FLOOR_CONE_DEG = 12.0  # how far up may be off where no edges tell it
-LATER = "`semantic-mapper scale` takes a known length of the map"
 
 CAMERA_ID = "camera"  # in the log
 
@@ -158,17 +155,6 @@ class _Lens:
         """(H, W, 3) BGR as structure from motion sees it."""
         return bgr if self.rectify is None else np.asarray(cv2.cvtColor(self.rectify(bgr), cv2.COLOR_RGB2BGR), np.uint8)
 
-    def seen_pixel(self, u: float, v: float) -> tuple[float, float]:
-        """A pixel of the film in what is seen."""
-        u, v = u * self.ratio, v * self.ratio
-        if self.rectify is None or self.measured is None:
-            return u, v
-        lens = np.array(self.measured.distortion or (0.0,) * 4)
-        K = camera_matrix(self.rectify.intrinsics)
-        undistort = cv2.fisheye.undistortPoints if isinstance(self.measured, FisheyeIntrinsics) else cv2.undistortPoints
-        flat = undistort(np.array([[[u, v]]], np.float64), camera_matrix(self.measured), lens, P=K)
-        return float(flat[0, 0, 0]), float(flat[0, 0, 1])
-
     def request(self, film: Film) -> colmap.Camera:
         """For the process."""
         if self.rectify is None:
@@ -210,8 +196,6 @@ class _Import:
             )
         rows = pick_frames(self._look)
         refusals.refuse_look(film.path, self._look, len(rows))
-        for mark in (self._options.scale.distance or ())[:2]:
-            self._check_mark(mark)
         picked = self._find_features(rows)
         model, error_px = self._map(picked)
         return self._write(dst, picked, self._place(model, picked), error_px, overwrite=overwrite)
@@ -307,7 +291,7 @@ class _Import:
             return _Scene(frames, seen, str(fit), None if floor is None else fit.scale * floor.below, str(fit.origin))
         try:
             factor, scale = self._scale(frames, seen, floor)
-        except ImportSourceError as error:  # nobody waits for the poses again: `scale` takes a length later
+        except ImportSourceError as error:  # the poses are good: `scale` takes a length later
             factor, scale = 1.0, ""
             self._notices.append(f"the scale is unknown: lengths of the log are not metres, since {error}")
         down = np.eye(4)
@@ -319,64 +303,19 @@ class _Import:
     def _scale(
         self, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics, floor: Floor | None
     ) -> tuple[float, str]:
-        """Metres per unit, and how they were found; empty = they were not. Raises ImportSourceError: what was to tell
-        them does not."""
+        """Metres per unit, and how they were found; empty = nothing was given. Raises ImportSourceError: not found."""
         hint = self._options.scale
         if hint.factor is not None:
             return hint.factor, f"given: {hint.factor:g} m per unit"
         if self._board is not None:
             return scale_by_board(self._board_seen, _poses(frames), seen)
         if hint.camera_height_m is not None:
-            if floor is None:
-                raise ImportSourceError(
-                    f"no floor is found under the camera for its height; {LATER}, or film more of the floor"
-                )
-            said = f"camera {hint.camera_height_m:g} m over a floor of {floor.points} points"
-            if floor.unsure:
-                said += ", unsure"
-                self._notices.append(
-                    f"little of the floor is seen ({floor.points} points): the scale may be a tenth off; {LATER}"
-                )
-            return hint.camera_height_m / floor.below, said
-        if hint.distance is not None:
-            *marks, metres = hint.distance
-            a, b = (self._marked_place(mark, frames, seen) for mark in marks)
-            found = float(np.linalg.norm(a - b))
-            if found < 1e-6:
-                raise ImportSourceError("the two marked points are one; mark two that are far apart")
-            return metres / found, f"two marked points, {metres:g} m apart"
+            return scale_by_floor(hint.camera_height_m, floor)
         self._notices.append(
-            "the scale is unknown: lengths of the log are not metres. Give one of --scale, --distance, --square-mm "
-            f"(with a printed board in the film) or --camera-height; {LATER}"
+            "the scale is unknown: lengths of the log are not metres. Give --scale, --camera-height or --square-mm "
+            "(with a printed board in the film), or later a known length of the map (`semantic-mapper scale`)"
         )
         return 1.0, ""
-
-    def _check_mark(self, mark: Mark) -> None:
-        """Refuse a mark outside of the film, before the long work begins."""
-        film, last_s = self._film, self._look.stamp_ns[-1] / 1e9
-        inside = 0 <= mark.u < film.full_width and 0 <= mark.v < film.full_height
-        if not inside or mark.time_s > last_s + 0.5 / film.hz:
-            raise ImportSourceError(
-                f"{film.path}: --distance marks {mark.time_s:g}:{mark.u:g},{mark.v:g}, outside of the film's "
-                f"{film.full_width}x{film.full_height} pixels, or after its last frame at {last_s:.2f} s"
-            )
-
-    def _marked_place(self, mark: Mark, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics) -> Float64:
-        look = self._look
-        row = int(np.argmin(np.abs(look.stamp_ns - 1e9 * mark.time_s)))
-        order = sorted(frames)
-        rows = np.searchsorted(look.index, order)
-        if np.abs(look.way[rows] - look.way[row]).min() > FOLLOWED:
-            near = sorted(self._seconds(order[n]) for n in np.argsort(np.abs(rows - row), kind="stable")[:4])
-            raise ImportSourceError(
-                f"{self._film.path}: --distance marks a point at {mark.time_s:g} s, where the camera's place was not "
-                f"found; mark it at another time, such as {', '.join(f'{s:.2f}' for s in near)} s"
-            )
-        at, marked = int(np.searchsorted(rows, row)), int(look.index[row])
-        chosen = {marked, *order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1]}
-        pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
-        pixel = Mark(mark.time_s, *self._lens.seen_pixel(mark.u, mark.v))
-        return marked_place(pixel, marked, pictures, _poses(frames), seen)
 
     def _write(self, dst: Path, picked: list[int], scene: _Scene, error_px: float, *, overwrite: bool) -> FilmReport:
         film, look = self._film, self._look

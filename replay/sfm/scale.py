@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import cv2
@@ -13,12 +11,12 @@ import msgspec
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from semantic_mapper.bundle.scale import cone
+from semantic_mapper.bundle.scale import Floor, cone
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.drivers.poses.config import BoardPoses
-from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.replay.sfm.between import RegisteredFrame, track
+from semantic_mapper.replay.sfm.between import RegisteredFrame
 from semantic_mapper.transport.messages import SCENE_DEPTH_KEY, StreamInfo
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, UInt8
 
@@ -32,16 +30,6 @@ MAX_RAY_ERROR = 0.01  # a place is no further from its rays than this fraction o
 MIN_RAY_FRACTION = 0.5  # of the rays that must do so
 MAX_RAY_PAIRS = 100  # that a place is first found by
 MIN_BOARD_CORNERS = 6
-NEIGHBOURS = 12  # frames either side that a marked point is followed into
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A pixel of a frame: seconds within the film, and where in the picture (u right, v down)."""
-
-    time_s: float
-    u: float
-    v: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,21 +37,8 @@ class ScaleHint:
     """What tells the size of the scene; the first of these that is given."""
 
     factor: float | None = None  # metres per unit of the log that comes without a scale
-    distance: tuple[Mark, Mark, float] | None = None  # two marked points, and how far apart they are in metres
     board: BoardPoses | None = None  # a printed board that is seen in the film
     camera_height_m: float | None = None  # of the camera over the floor, the median over the film
-
-
-def parse_distance(text: str) -> tuple[Mark, Mark, float]:
-    """``ScaleHint.distance`` of ``"T:U,V T:U,V METRES"``; ConfigError for another form."""
-    number = r"(\d+(?:\.\d+)?)"
-    found = re.fullmatch(rf"\s*{number}:{number},{number}\s+{number}:{number},{number}\s+{number}\s*", text)
-    if found is None or float(found[7]) <= 0:
-        raise ConfigError(
-            f"'{text}' marks no distance: write 'SECONDS:U,V SECONDS:U,V METRES', such as '3.2:310,220 3.2:560,231 0.9'"
-        )
-    a, b, c, d, e, f, metres = map(float, found.groups())
-    return Mark(a, b, c), Mark(d, e, f), metres
 
 
 def upright(T_world_first: Float64, up: Float64) -> Float64:
@@ -117,6 +92,17 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
     )
     fitted_depth = msgspec.structs.replace(config.depth, from_motion=motion)
     return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
+
+
+def scale_by_floor(height_m: float, floor: Floor | None) -> tuple[float, str]:
+    """Metres per unit by a camera's height over a floor, and a sentence on it. Raises ImportSourceError: no floor."""
+    if floor is None:
+        raise ImportSourceError(
+            "no floor is found under the camera for its height; give a length of the map (`semantic-mapper scale`), or "
+            "film more of the floor"
+        )
+    unsure = ", unsure: little of it is seen, so that the scale may be a tenth off" if floor.unsure else ""
+    return height_m / floor.below, f"camera {height_m:g} m over a floor of {floor.points} points{unsure}"
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
@@ -174,35 +160,6 @@ def scale_by_board(
     true, found = (cdist(at, at) for at in (np.array(list(corners)), np.stack(list(corners.values()))))
     pairs = true > 0.5 * true.max()  # long ones are the most exact
     return float(np.median(true[pairs] / found[pairs])), f"board: {len(corners)} corners in {len(posed)} frames"
-
-
-def marked_place(
-    mark: Mark, marked: int, pictures: Mapping[int, UInt8], poses: Mapping[int, Float64], intrinsics: CameraIntrinsics
-) -> Float64:
-    """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
-
-    ``marked`` is the index of its frame, which may lack a pose, ``pictures`` (H, W) gray ones of this and of registered
-    frames around it, ``poses`` T_world_camera (4, 4) of those. Raises ImportSourceError: it cannot be followed.
-    """
-    order = sorted(pictures)
-    at = order.index(marked)
-    rays: list[tuple[Float64, Float64]] = []
-    for way in (order[at:], order[: at + 1][::-1]):
-        xy = np.array([[[mark.u, mark.v]]], np.float32)
-        for last, now in pairwise(way):
-            xy, true = track(pictures[last], pictures[now], xy)
-            if not true[0]:
-                break
-            rays.append(ray_of(poses[now], xy[0, 0], intrinsics))
-    if marked in poses:
-        rays.append(ray_of(poses[marked], np.array((mark.u, mark.v)), intrinsics))
-    place = triangulate(rays)
-    if place is None:
-        raise ImportSourceError(
-            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be located: {len(rays)} frames show it, from one "
-            "side only; mark a corner with texture around it, at a time when the camera moves sideways"
-        )
-    return place
 
 
 MIN_LENGTH = 0.06  # of an edge, of the image's width

@@ -113,11 +113,10 @@ def find_floor(xyz: Float64, camera: Float64, up: Float64, cone_deg: float = 0.0
         if cone_deg:
             up = axes[:, 0] * np.sign(axes[:, 0] @ up)
         height = float(np.median((camera - on) @ up))
-    depth = (camera - xyz) @ up
-    count = int((np.abs(depth - height) < _LAYER * height).sum())
-    above = int((np.abs(depth - (1 - 4 * _LAYER) * height) < _LAYER * height).sum())
-    narrow = np.sqrt(spread[1]) < _WIDE * height
-    return Floor(up, height, count, bool(narrow or count < _MANY or count < 1.5 * _DENSER * above))
+    depth = (camera - xyz) @ up / height
+    count, above = (int((np.abs(depth - at) < _LAYER).sum()) for at in (1.0, 1.0 - 4 * _LAYER))
+    narrow = bool(np.sqrt(spread[1]) < _WIDE * height)
+    return Floor(up, height, count, narrow or count < max(_MANY, 1.5 * _DENSER * above))
 
 
 def cone(axis: Float64, half_deg: float, step_deg: float) -> Float64:

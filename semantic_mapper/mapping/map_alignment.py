@@ -47,13 +47,6 @@ class MapAlignment:
     looked_for: int  # of so many
 
 
-def _nothing_to_find(which: str) -> str:
-    return (
-        f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without depth, or "
-        f"with keyframes.save_places = false). {_WAY_OUT}"
-    )
-
-
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     """Where another map lies in this one.
 
@@ -62,7 +55,10 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(_nothing_to_find(which))
+            raise MapError(
+                f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without "
+                f"depth, or with keyframes.save_places = false). {_WAY_OUT}"
+            )
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
     looks = [(place, _find(finder, other, place)) for place in chosen]

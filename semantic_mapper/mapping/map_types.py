@@ -19,8 +19,8 @@ from semantic_mapper.types import Bool, Float32, Float64, UInt8
 CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
 ALWAYS = 2**63 - 1  # later than any stamp
 SCALE_FIX = (
-    "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
-    "visual odometry (scale, distance_m or camera_height_m), and map it again"
+    "`semantic-mapper scale` takes a known length of the map; or give a scale when the film or recording is imported "
+    "(--square-mm, --camera-height or --scale), or to visual odometry (scale, distance_m or camera_height_m)"
 )
 
 

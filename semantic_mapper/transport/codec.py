@@ -354,6 +354,13 @@ def with_computed_depth(parts: Parts, depth_m: Float32, sigma_m: Float32) -> lis
     return _with_images(parts, {"depth": encode_depth(depth_m, scale), "depth_sigma": encode_depth(sigma_m, scale)})
 
 
+def scaled_frame(parts: Parts, factor: float) -> list[bytes]:
+    """A frame whose pose is so many times as far from the origin; all else, depth too, stays, byte for byte."""
+    T = np.array(_open_frame(parts)[0].T_world_camera).reshape(4, 4)
+    T[:3, 3] *= factor
+    return _with_images(parts, {}, T_world_camera=tuple(T.ravel().tolist()))
+
+
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     """A frame with its colour image packed as ``options`` say; all else, and an image that is so already, stays."""
     header, buffers = _open_frame(parts)

@@ -28,7 +28,7 @@ def test_it_is_saved_merged_and_taken_over_and_never_mixed(tmp_path: Path) -> No
         loaded = VoxelMap.load(tmp_path / "map.npz")
         assert loaded.scale_known == loaded.merged(loaded, np.eye(4)).scale_known == voxel_map.scale_known
     for one, other in ((known, unknown), (unknown, known)):
-        with pytest.raises(MapError, match=r"scale of the other is unknown; .*--distance.*--camera-height"):
+        with pytest.raises(MapError, match=r"scale of the other is unknown; .*mapper scale.*--camera-height"):
             one.merged(other, np.eye(4))
     fresh = small_map()
     fresh.take_over(unknown)

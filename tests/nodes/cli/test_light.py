@@ -54,6 +54,7 @@ ERRORS = (  # of what is heavy where it goes well
     "autolabel none.mcap --weights rooms --out x.mcap",
     "label none.mcap --suggest 3",
     "merge none.npz map.npz --out x.npz",
+    "scale none --height 1.5",
     "fleet run map none.mcap --out x",
     "refine none.npz --out x.npz",
 )

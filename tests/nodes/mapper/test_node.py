@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from unittest.mock import Mock
@@ -17,7 +16,7 @@ from semantic_mapper.nodes.mapper.saved_map import resume_map
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN
 from tests.nodes.mapper.test_live_correction import running_robot, settle, true_poses
 from tests.nodes.mapper.test_resume import context
-from tests.nodes.support import eventually, refused, run_ok
+from tests.nodes.support import eventually
 from tests.small import tiny_frames
 
 
@@ -75,19 +74,3 @@ def test_a_live_map_without_metres(weights: Path, tmp_path: Path) -> None:
         assert robot.end(4)["scale"] == SCALE_UNKNOWN
     assert not VoxelMap.load(out / "map.npz").scale_known
     assert b"comment scale: unknown\n" in (out / "map.ply").read_bytes()[:200]
-
-
-def test_what_the_command_says_of_a_saved_map_without_metres(replayed: Path, tmp_path: Path) -> None:
-    voxel_map, saved, plan = VoxelMap.load(replayed / "map.npz"), tmp_path / "map.npz", tmp_path / "plan.yaml"
-    voxel_map.note_scale(False)
-    voxel_map.save(saved)
-    assert json.loads(run_ok("query", saved, "info", "--json").stdout)["scale"] == SCALE_UNKNOWN
-    said = run_ok("info", saved).stdout
-    assert "units (scale unknown)" in said and " cm" not in said
-    for said, words in (
-        ("scale is unknown; give a scale", ("query", saved, "nearest", "floor", "0", "0", "0")),
-        ("scale is unknown", ("export", saved, "--out", plan)),
-        ("scale of the other is unknown", ("merge", saved, replayed, "--out", tmp_path / "both.npz")),
-    ):
-        assert said in refused(*words)
-    assert "scale of the other is unknown" in refused("compare", saved, replayed, code=2) and not plan.exists()

@@ -154,7 +154,7 @@ def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: Voxe
         assert str(read["scale"]) == "unknown"
     export_map(unknown, tmp_path / "a.rrd", ExportRequest("rrd"))
     assert "/scale" in {chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
-    with pytest.raises(MapError, match=r"floor plan: needs metres.*--distance"):
+    with pytest.raises(MapError, match=r"floor plan: needs metres.*mapper scale"):
         export_map(unknown, tmp_path / "plan.yaml", ExportRequest("grid"))
     assert not (tmp_path / "plan.pgm").exists()
 

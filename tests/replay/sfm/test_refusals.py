@@ -4,33 +4,11 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 
-import numpy as np
 import pytest
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.sfm.colmap import FocalCheck, Outcome, Pair
-from semantic_mapper.replay.sfm.film import FilmLook
-from semantic_mapper.replay.sfm.refusals import baseline_notes, focal_note, refuse_look, refuse_outcome
-
-
-def look_of(motion: float, count: int = 60, dark: float = 0.0) -> FilmLook:
-    same = np.full(count, motion)
-    stamps_ns = np.arange(count) * 100_000_000
-    return FilmLook(np.arange(count), stamps_ns, same, same, np.ones(count), np.arange(count) < dark * count)
-
-
-@pytest.mark.parametrize(
-    ("look", "picks", "says"),
-    [
-        (look_of(0.02, dark=0.9), 20, "^film.mp4: 90 % of its frames are black"),
-        (look_of(0.0005), 1, "does not move"),
-        (look_of(0.02, count=10), 5, "too short"),
-    ],
-)
-def test_the_first_look_refuses(look: FilmLook, picks: int, says: str) -> None:
-    with pytest.raises(ImportSourceError, match=says):
-        refuse_look("film.mp4", look, picks)
-
+from semantic_mapper.replay.sfm.refusals import focal_note, refuse_outcome
 
 TIMES = [0.5 * n for n in range(20)]
 
@@ -65,12 +43,3 @@ def test_a_calibration_is_doubted_where_the_pictures_are_sure() -> None:
     assert "camera.toml is 500 px" in note(1.08, 20.0)[0] and "460 px" in note(0.92, 20.0)[0]
     with pytest.raises(ImportSourceError, match=r"500 px .* 1000 px"):
         note(2.0, 50.0)
-
-
-def test_what_a_straight_way_tells_badly_is_noted() -> None:
-    assert baseline_notes(False, 12.0, 0.003) == []
-    (ahead,) = baseline_notes(True, 6.3, None)
-    assert "straight ahead" in ahead and "6.3 degrees" in ahead
-    (lens,) = baseline_notes(False, 12.0, 0.047)
-    assert "exact to 4.7 % only" in lens and "--calibration" in lens
-    assert "57 %" in baseline_notes(True, 6.3, 0.57)[1]

@@ -8,13 +8,10 @@ from semantic_mapper.bundle.scale import find_floor
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.drivers.poses.board import BoardFinder, make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
-from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose, look_at, make_pose, project, transform
 from semantic_mapper.replay.sfm.scale import (
-    Mark,
     fit_to_scene,
-    marked_place,
-    parse_distance,
     scale_by_board,
     scene_depth,
     vertical,
@@ -24,13 +21,6 @@ from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 CAMERA = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240, (0.05, 0.0, 0.0, 0.0))
 UP = np.eye(3)[2]
-
-
-def test_marked_distances_are_read() -> None:
-    assert parse_distance("3.2:310,220 14:5.5,7 0.9") == (Mark(3.2, 310, 220), Mark(14, 5.5, 7), 0.9)
-    for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
-        with pytest.raises(ConfigError, match="marks no distance"):
-            parse_distance(text)
 
 
 def test_the_floor_is_the_lowest_layer_never_a_table(rng: np.random.Generator) -> None:
@@ -99,23 +89,6 @@ def test_a_board_tells_the_scale() -> None:
     assert found == pytest.approx(scaled, rel=0.01) and "board" in how
     with pytest.raises(ImportSourceError, match="board tells no scale"):
         scale_by_board(seen, {0: poses[0]}, camera)
-
-
-def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng: np.random.Generator) -> None:
-    import cv2
-
-    camera = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240)
-    wall = cv2.resize(rng.integers(0, 255, (60, 120), np.uint8), (480, 240), interpolation=cv2.INTER_CUBIC)
-    step = 8  # pixels a frame, of a wall 3 m ahead
-    pictures = {n: np.ascontiguousarray(wall[:, step * n : step * n + 320]) for n in range(9)}
-    poses = {n: np.eye(4) for n in pictures if n != 4}
-    for n, pose in poses.items():
-        pose[0, 3] = n * step * 3.0 / 300.0
-    place = marked_place(Mark(0.4, 180.0, 100.0), 4, pictures, poses, camera)
-    true = ((180 - 159.5) / 100 + 4 * step * 0.01, (100 - 119.5) / 100, 3.0)
-    assert place == pytest.approx(true, abs=0.02)
-    with pytest.raises(ImportSourceError, match="cannot be located"):
-        marked_place(Mark(0.4, 180.0, 100.0), 4, {4: pictures[4]}, poses, camera)
 
 
 def test_ranges_follow_a_scene_that_is_larger_than_a_room_and_given_settings_stay() -> None:
