@@ -9,15 +9,56 @@ import sys as _sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semantic_mapper.client import MapClient as MapClient
+    from semantic_mapper.client import MapClient
+    from semantic_mapper.errors import SemanticMapperError
     from semantic_mapper.fields.checkpoint import load_checkpoint as load_weights
-    from semantic_mapper.mapper import Mapper as Mapper
-    from semantic_mapper.mapping.voxel_map import VoxelMap as VoxelMap
-    from semantic_mapper.replay.log.sequence import open_log as open_log
-    from semantic_mapper.training.finetune import finetune as finetune
-    from semantic_mapper.types import PosedFrame as PosedFrame
+    from semantic_mapper.labels import LabelSet
+    from semantic_mapper.mapper import Mapper
+    from semantic_mapper.mapping.floor_plan import OccupancyGrid
+    from semantic_mapper.mapping.map_types import CameraPose, MapPoints
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.queries.graph import Door, Floor, Room, SceneGraph
+    from semantic_mapper.queries.instances import Instance, OrientedBox
+    from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+    from semantic_mapper.queries.occupancy import DistanceField, State
+    from semantic_mapper.queries.questions import Correction, MapInfo, Weights, WeightsEntry
+    from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+    from semantic_mapper.queries.surface import RayHits
+    from semantic_mapper.replay.log.sequence import open_log
+    from semantic_mapper.training.finetune import finetune
+    from semantic_mapper.types import PosedFrame
 
-__all__ = ["MapClient", "Mapper", "PosedFrame", "VoxelMap", "finetune", "load_weights", "open_log"]
+__all__ = [
+    "CameraPose",
+    "Correction",
+    "DistanceField",
+    "Door",
+    "Floor",
+    "Instance",
+    "LabelSet",
+    "MapClient",
+    "MapInfo",
+    "MapMirror",
+    "MapPoints",
+    "MapSnapshot",
+    "Mapper",
+    "NearestSurface",
+    "OccupancyGrid",
+    "OrientedBox",
+    "PointAnswers",
+    "PosedFrame",
+    "RayHits",
+    "Room",
+    "SceneGraph",
+    "SemanticMapperError",
+    "State",
+    "VoxelMap",
+    "Weights",
+    "WeightsEntry",
+    "finetune",
+    "load_weights",
+    "open_log",
+]
 __version__ = "0.1.0"
 
 # OpenMP reads this once, when torch is loaded. Its threads otherwise spin for milliseconds after an operation and take
@@ -25,22 +66,33 @@ __version__ = "0.1.0"
 SPINNING_THREADS = "torch" in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ
 _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-_HOMES = {
-    "MapClient": ("semantic_mapper.client", "MapClient"),
-    "Mapper": ("semantic_mapper.mapper", "Mapper"),
-    "PosedFrame": ("semantic_mapper.types", "PosedFrame"),
-    "VoxelMap": ("semantic_mapper.mapping.voxel_map", "VoxelMap"),
-    "finetune": ("semantic_mapper.training.finetune", "finetune"),
-    "load_weights": ("semantic_mapper.fields.checkpoint", "load_checkpoint"),
-    "open_log": ("semantic_mapper.replay.log.sequence", "open_log"),
+_HOMES = {  # modules below this package, by name; where it is called otherwise there, as MODULE:NAME
+    "MapClient": "client",
+    "SemanticMapperError": "errors",
+    "load_weights": "fields.checkpoint:load_checkpoint",
+    "LabelSet": "labels",
+    "Mapper": "mapper",
+    "OccupancyGrid": "mapping.floor_plan",
+    **dict.fromkeys(("CameraPose", "MapPoints"), "mapping.map_types"),
+    "VoxelMap": "mapping.voxel_map",
+    **dict.fromkeys(("Door", "Floor", "Room", "SceneGraph"), "queries.graph"),
+    **dict.fromkeys(("Instance", "OrientedBox"), "queries.instances"),
+    **dict.fromkeys(("NearestSurface", "PointAnswers"), "queries.nearest"),
+    **dict.fromkeys(("DistanceField", "State"), "queries.occupancy"),
+    **dict.fromkeys(("Correction", "MapInfo", "Weights", "WeightsEntry"), "queries.questions"),
+    **dict.fromkeys(("MapMirror", "MapSnapshot"), "queries.snapshot"),
+    "RayHits": "queries.surface",
+    "open_log": "replay.log.sequence",
+    "finetune": "training.finetune",
+    "PosedFrame": "types",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _HOMES[name]
-    value = getattr(_importlib.import_module(module), attribute)
+    module, _, attribute = _HOMES[name].partition(":")
+    value = getattr(_importlib.import_module(f"{__name__}.{module}"), attribute or name)
     globals()[name] = value
     return value
 

@@ -1,16 +1,18 @@
-"""Ask the map of a running mapper, or correct its poses, from any process of this machine."""
+"""Ask the map of a running mapper, or correct its poses, from any process."""
 
 from __future__ import annotations
 
 import threading
 import uuid
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
-from semantic_mapper.errors import CodecError, ShapeError
+from semantic_mapper.errors import CodecError, ShapeError, TransportError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.checks import as_numbers
@@ -21,14 +23,17 @@ from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, Request, Weights
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import RayHits
-from semantic_mapper.transport.endpoints import Closing, default_endpoint
-from semantic_mapper.transport.keys import ServerIdentity
+from semantic_mapper.transport.endpoints import Closing
+from semantic_mapper.transport.keys import server_identity
+from semantic_mapper.transport.launches import LIVE, MapperAddress, find_mapper
 from semantic_mapper.transport.sockets import QuerySocket
 from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
 GRACE_S = 0.5  # in which a question that timed out is sent again, and keeps its turn
+
+_log = get_logger(__name__)
 
 
 class MapClient(Closing):
@@ -39,27 +44,31 @@ class MapClient(Closing):
     mapper that was restarted is found again. What takes or gives metres is refused (``MapError``) where the map has
     none (``MapInfo.scale_known``). Any thread may call; calls wait for each other.
 
-    ``version`` is the version of the map that the last answer was about. Raises TransportError: an invalid endpoint, or
-    a mapper that is not among the peers.
+    ``version`` is the version of the map that the last answer was about. Raises TransportError: no launch runs here, or
+    several could be meant (names them); an invalid endpoint; or a mapper that is not among the peers.
 
     Args:
-        endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
+        place: ``live``, the one launch that runs on this machine; a launch by the name of its file ("replay") or by its
+            socket folder; or the endpoint of a mapper (tcp://HOST:PORT, ipc://PATH). One that ended is looked for again
+            at the next call.
+        server: Name of the mapper's machine among the peers of ``keys``, as those on other machines have.
+        keys: Folder of the keys (``semantic-mapper keys``); by default this user's, where a server is named.
         timeout_s, attempts: How long to wait for an answer before asking again, and how often to ask.
-        identity: Of a mapper that has keys (``transport.keys``), as those on other machines have.
     """
 
     def __init__(
         self,
-        endpoint: str | None = None,
+        place: str = LIVE,
         *,
+        server: str = "",
+        keys: Path | None = None,
         timeout_s: float = 5.0,
         attempts: int = 3,
-        identity: ServerIdentity | None = None,
     ) -> None:
-        self._asker, self._timeout_s = uuid.uuid4().hex, timeout_s
-        self._socket = QuerySocket(
-            endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts, identity=identity
-        )
+        self._asker, self._place, self._identity = uuid.uuid4().hex, place, server_identity(server, keys)
+        self._timeout_s, self._attempts = timeout_s, attempts
+        self._socket_lock = threading.Lock()
+        self._socket, self._closed, self._unanswered = self._connect(find_mapper(place)), False, False
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
         self._mirror_lock = threading.Lock()
@@ -198,7 +207,9 @@ class MapClient(Closing):
 
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
-        self._socket.close()
+        with self._socket_lock:
+            self._closed = True
+            self._socket.close()
 
     def _ask(self, request: Request[AnswerT]) -> AnswerT:
         return self._ask_about(request)[1]
@@ -207,11 +218,33 @@ class MapClient(Closing):
         """Also which map the answer is about."""
         name = questions.NAMES[type(request)]
         request = replace(request, asker=self._asker, waits_s=min(self._timeout_s + GRACE_S, questions.MAX_WAIT_S))
-        parts = self._socket.ask(questions.encode_request(name, request))
+        parts = self._answered(questions.encode_request(name, request))
         found: tuple[questions.MapState, Any] = questions.decode_answer(name, questions.QUESTIONS[name].answer, parts)
         if request.about_map:
             self.version = found[0].version
         return found
+
+    def _answered(self, parts: list[bytes]) -> list[bytes]:
+        """The answer to a question, from the launch that is meant now: its mapper may have ended since the last one."""
+        with self._socket_lock:
+            path = Path(self._socket.endpoint.removeprefix("ipc://"))
+            if not self._closed and (self._unanswered or (path.is_absolute() and not path.exists())):
+                address = find_mapper(self._place)
+                if address.endpoint != self._socket.endpoint:
+                    _log.warning("another_launch_answers", before=self._socket.endpoint, now=address.endpoint)
+                    self._socket.close()
+                    self._socket = self._connect(address)
+                self._unanswered = False
+            socket = self._socket
+        try:
+            return socket.ask(parts)
+        except TransportError:
+            self._unanswered = True
+            raise
+
+    def _connect(self, address: MapperAddress) -> QuerySocket:
+        identity = self._identity or address.identity
+        return QuerySocket(address.endpoint, timeout_s=self._timeout_s, attempts=self._attempts, identity=identity)
 
 
 def _point(values: ArrayLike, name: str) -> Point:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
 import semantic_mapper
+from semantic_mapper.client import MapClient
+from semantic_mapper.queries.snapshot import MapSnapshot
 
 
 @pytest.mark.parametrize("name", semantic_mapper.__all__)
@@ -49,3 +53,18 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     program = "import semantic_mapper, sys; print(sorted({'torch', 'numpy', 'zmq', 'open3d'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
     assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
+
+
+def test_all_that_a_client_receives_is_public() -> None:
+    wanted: list[Any] = [
+        get_type_hints(value)["return"] for name, value in vars(MapClient).items() if name[0] != "_" and callable(value)
+    ]
+    found: set[str] = set()
+    while wanted:
+        kind = wanted.pop()
+        wanted += get_args(kind)
+        if getattr(kind, "__module__", "").startswith("semantic_mapper.") and kind.__name__ not in found:
+            found.add(kind.__name__)
+            wanted += get_type_hints(kind).values() if is_dataclass(kind) and kind is not MapSnapshot else ()
+    assert found <= {*semantic_mapper.__all__}, found - {*semantic_mapper.__all__}
+    assert {"Instance", "OrientedBox", "Room", "MapMirror", "WeightsEntry"} <= found

@@ -38,14 +38,14 @@ def goal_before(found: NearestSurface, position: ArrayLike) -> NDArray[np.float6
     return found.xyz + way * min(1.0, STAND_OFF_M / max(found.distance_m, 1e-6))
 
 
-def sightings(class_name: str, position: ArrayLike, updates: str, questions: str | None = None) -> Iterator[Sighting]:
+def sightings(class_name: str, position: ArrayLike, updates: str, questions: str = "live") -> Iterator[Sighting]:
     """Ask after each update of the map, until the mapper ends or falls silent.
 
     Args:
         class_name: What to look for.
         position: (3,) of the robot, world metres.
         updates: Endpoint that the mapper publishes at.
-        questions: Endpoint that it answers at; None = that of a mapper of this user.
+        questions: Where it answers, as of ``MapClient``; by default the launch that runs here.
     """
     with NewestSubscriber(updates, ("map", "status")) as mapper, MapClient(questions) as client:
         while True:
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("position", nargs=3, type=float, metavar=("X", "Y", "Z"), help="of the robot, metres")
     # By default those of a mapper that was started by hand; one of a launch has them where its launch file says.
     parser.add_argument("--updates", metavar="ENDPOINT", default=default_endpoint("mapper"), help="it publishes at")
-    parser.add_argument("--questions", metavar="ENDPOINT", help="it answers at")
+    parser.add_argument("--questions", metavar="PLACE", default=default_endpoint("query"), help="it answers at")
     given = parser.parse_args()
     print(f"following {given.updates}", flush=True)
     for seen in sightings(given.class_name, given.position, given.updates, given.questions):

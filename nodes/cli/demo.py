@@ -15,13 +15,13 @@ from semantic_mapper.nodes.cli.mapping import show_result
 from semantic_mapper.nodes.cli.up import run_launch
 from semantic_mapper.nodes.cli.verb import MapperSettings, WeightsOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.launcher import running
 from semantic_mapper.nodes.launcher.launch_file import find_launch, load_launch
 from semantic_mapper.nodes.launcher.liveness import end_with_launcher
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import end_process
 from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import prepare_folder
+from semantic_mapper.transport.launches import LIVE, running_launches
 
 LAUNCH = Path("camera")  # that of the package
 RATE = 0.3  # of the recorded time: its 24 frames last 5 s, and half of a core is left for the viewer
@@ -85,7 +85,7 @@ def _show_live(stack: ExitStack, folder: Path) -> None:
     )
     stack.callback(end_process, viewer)
     program = "semantic-mapper" if shutil.which("semantic-mapper") else sys.argv[0]
-    place = running.LIVE if len(running.running_launches()) == 1 else str(folder)
+    place = LIVE if len(running_launches()) == 1 else str(folder)
     console = stderr_console()
     console.print("the room is mapped again and again until Ctrl-C; meanwhile, in another terminal:", style="bold")
     for words in (f"query {place} nearest chair 0 0 1", f"info {place}", "view --status"):

@@ -19,7 +19,6 @@ from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
-from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note
@@ -28,6 +27,7 @@ from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file, refuse_overwriting
+from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 BOX_FILES = (".json", ".xml")
@@ -65,8 +65,8 @@ def info(
         found = _boxes_info(output, path, picture, out)
     elif path.suffix == ".safetensors":
         found = _weights_file_info(output, path)
-    elif endpoint := map_endpoint(file[0]):
-        found = _weights_info(output, endpoint, remote)
+    elif is_running_mapper(file[0]):
+        found = _weights_info(output, file[0], remote)
     elif is_map(path):
         if len(file) > 1:
             raise typer.BadParameter("one map at a time")
@@ -231,9 +231,9 @@ def _map_table(found: dict[str, Any]) -> Table:
     return table(rows, title=found["map"])
 
 
-def _weights_info(output: Output, endpoint: str, remote: Remote) -> dict[str, Any]:
+def _weights_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
     """The weights of a running mapper."""
-    with MapClient(endpoint, identity=remote.identity()) as client:
+    with MapClient(place, server=remote.server, keys=remote.keys) as client:
         state = client.weights()
     rows = [
         (

@@ -13,11 +13,11 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Port, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
-from semantic_mapper.nodes.launcher.running import socket_in_launch
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.launches import socket_in_launch
 from semantic_mapper.transport.messages import LabelledKeyframe
 from semantic_mapper.transport.sockets import Publisher
 

@@ -33,7 +33,6 @@ from semantic_mapper.nodes.cli.verb import (
     wrong_usage,
 )
 from semantic_mapper.nodes.console import Output, frame_progress, table
-from semantic_mapper.nodes.launcher.running import map_endpoint
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, draw_graph
@@ -45,6 +44,7 @@ from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
 from semantic_mapper.replay.run_folder import map_path, prepare_file
+from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 POLL_S = 0.2
@@ -87,12 +87,12 @@ def query(
     """
     name, point = _read_arguments(question, arguments or [])
     with wrong_usage():
-        direction, endpoint = parse_up(up), map_endpoint(source)
+        direction, live = parse_up(up), is_running_mapper(source)
     axis: Up | None = None if direction is None else tuple(direction.tolist())
     if question == "correct":
-        return _correct(output, source, endpoint, Path(name), camera, remote)
+        return _correct(output, source, Path(name), camera, remote, live=live)
     refuse_options(
-        (gone and not (endpoint and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
+        (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
         (picture is not None and question != "graph", "--picture", "goes with `graph`"),
     )
@@ -101,11 +101,11 @@ def query(
         prepare_file(path)
     code = 0
     if question == "relocalize":
-        found = _relocalize(output, source, endpoint, Path(name), every)
+        found = _relocalize(output, source, Path(name), every, live=live)
         located = [session["T_map_world"] is not None for session in found["sessions"]]
         code = 0 if located and all(located) else EXIT_FAILED
     else:
-        client = MapClient(endpoint, identity=remote.identity()) if endpoint else nullcontext(open_saved(source))
+        client = MapClient(source, server=remote.server, keys=remote.keys) if live else nullcontext(open_saved(source))
         with client as world_map:
             values = (question, name, point, axis, min_confidence, gone, unsure, picture)
             found = {"map": source, **answer(world_map, *values)}
@@ -186,9 +186,9 @@ def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tupl
         raise typer.BadParameter(f"X Y Z must be numbers, got {' '.join(arguments)}") from error
 
 
-def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str, remote: Remote) -> int:
+def _correct(output: Output, source: str, file: Path, camera: str, remote: Remote, *, live: bool) -> int:
     """Send corrected poses to a running mapper."""
-    if not endpoint:
+    if not live:
         raise ConfigError(
             f"{source}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
             f"`semantic-mapper map LOG --corrections {file} --out FOLDER`"
@@ -196,7 +196,7 @@ def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str
     trajectory = read_corrections(file)
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
-    with MapClient(endpoint, identity=remote.identity()) as client:
+    with MapClient(source, server=remote.server, keys=remote.keys) as client:
         begun = client.correct_poses(poses, until_ns=ALWAYS, within_ns=MATCH_NS)
         with frame_progress("correct", None) as bar:
             state = client.correction()
@@ -212,9 +212,9 @@ def _correct(output: Output, source: str, endpoint: str, file: Path, camera: str
     return EXIT_FAILED if state.failure else 0
 
 
-def _relocalize(output: Output, source: str, endpoint: str, log: Path, every: int) -> dict[str, Any]:
+def _relocalize(output: Output, source: str, log: Path, every: int, *, live: bool) -> dict[str, Any]:
     """Find the frames of a log in a saved map."""
-    if endpoint:
+    if live:
         raise ConfigError(
             f"{source}: is a running mapper, and frames are found in a saved map; `up --set map=FILE` goes on in one"
         )

@@ -14,7 +14,6 @@ from semantic_mapper.errors import ConfigError, LogError
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, OverwriteOption, SettingOptions, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
-from semantic_mapper.nodes.launcher.running import launch_folder, read_launch_note
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
@@ -22,6 +21,7 @@ from semantic_mapper.nodes.recorder.node import Recorder
 from semantic_mapper.nodes.recorder.node import record as record_until_end
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.run_folder import prepare_file
+from semantic_mapper.transport.launches import launch_folder, read_launch_note
 
 HEAR_S = 10.0  # how long the nodes, which run already, may take to answer
 

@@ -211,12 +211,10 @@ class Remote(Options, frozen=True):
     keys: Path | None = None  # --server: folder of the keys
 
     def identity(self) -> ServerIdentity | None:
-        """Whom to expect at the other end; None where no server is named. Raises TransportError: no keys."""
-        from semantic_mapper.transport.keys import ServerIdentity, load_keys, user_key_folder
+        """Whom to expect at the other end; see ``server_identity``, also for errors."""
+        from semantic_mapper.transport.keys import server_identity
 
-        if not self.server:
-            return None
-        return ServerIdentity(load_keys(self.keys or user_key_folder()), self.server)
+        return server_identity(self.server, self.keys)
 
 
 def verb(function: Callable[..., int | None]) -> Callable[..., None]:

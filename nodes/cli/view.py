@@ -15,10 +15,10 @@ from semantic_mapper.errors import ConfigError, TransportError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, WeightsOption, refuse_options, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher import running
-from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import ViewerPage
 from semantic_mapper.replay.run_folder import is_log, is_map, map_path
+from semantic_mapper.transport.launches import STATUS_SOCKET, launch_folder, read_launch_note, socket_in_launch
 from semantic_mapper.transport.sockets import NewestSubscriber
 
 if TYPE_CHECKING:
@@ -97,21 +97,21 @@ def view(
 
 def _find_live(source: str, remote: Remote) -> Live:
     """Endpoints of a running launch, or of a mapper anywhere."""
-    folder = None if "://" in source else running.launch_folder(source)
+    folder = None if "://" in source else launch_folder(source)
     from semantic_mapper.nodes.viewer.sources import Live
 
     if folder is None:
-        return Live(source, (), remote.identity())
+        return Live(source, (), remote.server, remote.keys)
     nodes = running.node_endpoints(folder)
-    streams = sum(camera in nodes for camera in running.read_launch_note(folder).names("camera"))
-    return Live(f"ipc://{folder}/{running.QUERY_SOCKET}", tuple(nodes.values()), streams=streams)
+    streams = sum(camera in nodes for camera in read_launch_note(folder).names("camera"))
+    return Live(str(folder), tuple(nodes.values()), streams=streams)
 
 
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:
     """A running launch as a table."""
     if not output.console.is_terminal:
         output.console.width = FILE_WIDTH
-    endpoint = running.socket_in_launch(place, STATUS_SOCKET)
+    endpoint = socket_in_launch(place, STATUS_SOCKET)
     view = running.LaunchView()
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
         deadline = time.monotonic() + ANSWER_S

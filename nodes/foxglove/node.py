@@ -28,7 +28,6 @@ from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.codec import decode_as, read_envelope
-from semantic_mapper.transport.keys import ServerIdentity, load_keys
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -54,12 +53,12 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
 
     os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))  # threads inherit it
     endpoints = [context.endpoint(name) for name in options.inputs()]
-    identity = ServerIdentity(load_keys(Path(options.keys).expanduser())) if options.keys else None
+    keys = Path(options.keys).expanduser() if options.keys else None
     with ExitStack() as stack:
         server = stack.enter_context(FoxgloveServer(options.port))
         _log.info("serving", foxglove_websocket=server.url)
         publisher = stack.enter_context(Publisher(context.endpoint(context.name)))
-        client = stack.enter_context(MapClient(context.endpoint(options.query), attempts=1, identity=identity))
+        client = stack.enter_context(MapClient(context.endpoint(options.query), attempts=1, keys=keys))
         sender = _MapSender(client, server)
         follower = stack.enter_context(MapFollower(sender.look, options.refresh_s, PAUSE))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))

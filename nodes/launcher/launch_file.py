@@ -34,9 +34,9 @@ from semantic_mapper.nodes.options import (
     RecorderOptions,
     check_tracking,
 )
+from semantic_mapper.transport.launches import STATUS_SOCKET
 
 LAUNCH_FOLDER = Path(semantic_mapper.__file__).parent / "launch_files"  # ``launch/`` of the top level
-STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
 MAX_NODES = 64  # each is a process
 # What a camera without poses in its file has: the source that needs nothing else.
 DEFAULT_POSES = {"oak": "device", "realsense": "rgbd", "stereo": "rgbd"}

@@ -15,14 +15,15 @@ import structlog
 from msgspec.structs import replace
 
 from semantic_mapper.errors import CodecError, NodeError, TransportError
-from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch
+from semantic_mapper.nodes.launcher.launch_file import Launch
 from semantic_mapper.nodes.launcher.processes import STOP_S, ManagedProcess
 from semantic_mapper.nodes.launcher.running import leave_launch_note
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.process_folder import OwnFolder, sweep
 from semantic_mapper.nodes.publishing import PublicPublisher
 from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.launches import STATUS_SOCKET
 from semantic_mapper.transport.messages import NodeState, Status
+from semantic_mapper.transport.process_folder import OwnFolder, sweep
 from semantic_mapper.transport.sockets import NewestSubscriber
 
 POLL_S = 0.05

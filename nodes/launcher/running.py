@@ -1,11 +1,7 @@
-"""Launches of this user that run on this machine: what each of them is, where its sockets are, and how its nodes are.
-
-A launch leaves a note in its socket folder: for logs that keep it, and for those who join it from outside.
-"""
+"""What a launch says of itself: its note, and how its nodes are; ``transport.launches`` finds those that run."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,102 +12,30 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from semantic_mapper.config import MAX_FILE_BYTES
 from semantic_mapper.errors import TransportError
-from semantic_mapper.files import read_regular, write_bytes
-from semantic_mapper.nodes.launcher.launch_file import STATUS_SOCKET, Launch, NodeEntry
-from semantic_mapper.nodes.process_folder import is_in_use, own_folders
+from semantic_mapper.files import write_bytes
+from semantic_mapper.nodes.launcher.launch_file import Launch
 from semantic_mapper.plain_text import plain_without_secrets, visible
 from semantic_mapper.replay.summary import dig
+from semantic_mapper.transport.launches import NOTE, STATUS_SOCKET
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 
-NOTE = "launch.json"
 START_S = 180.0  # how long nodes may take to start
 LISTEN_S = 0.5
 RATE_WINDOW_S = 5.0  # over which rates are taken, where so much has been seen
 RATE_LEAST_S = 2.0  # nodes tell their totals once a second
 _KEPT = 64  # statuses a node
-LIVE = "live"  # on the command line: the mapper of the one launch that runs here
-QUERY_SOCKET = "query"  # where a mapper answers unless its launch file says otherwise
-
-
-class LaunchNote(msgspec.Struct, frozen=True):
-    """The nodes of a launch, with all their options, in the order of its file."""
-
-    launch: str  # name of the file
-    nodes: tuple[NodeEntry, ...]
-
-    def names(self, kind: str) -> tuple[str, ...]:
-        """Nodes of a kind."""
-        return tuple(node.name for node in self.nodes if node.kind == kind)
 
 
 def leave_launch_note(launch: Launch, folder: Path) -> None:
-    """Write the note of a launch into its folder, as it may stand in every recording."""
+    """Write the note of a launch (``LaunchNote``) into its folder, as it may stand in every recording."""
     options = plain_without_secrets(msgspec.to_builtins(launch.options))
-    nodes = tuple(msgspec.structs.replace(n, options=options[n.name]) for n in launch.nodes)
-    text = msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1)
+    for keys in (o for o in options.values() if o.get("keys")):  # who reads it may be in another folder
+        keys["keys"] = str(Path(keys["keys"]).expanduser().absolute())
+    nodes = [msgspec.structs.replace(n, options=options[n.name]) for n in launch.nodes]
+    text = msgspec.json.format(msgspec.json.encode({"launch": launch.name, "nodes": nodes}), indent=1)
     write_bytes(folder / NOTE, text, sync="none")
-
-
-def read_launch_note(folder: Path) -> LaunchNote:
-    """Of a launch that runs. Raises TransportError: there is no launch, or it cannot be understood."""
-    try:
-        return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
-    except (OSError, msgspec.DecodeError) as error:
-        raise TransportError(f"{folder / NOTE}: no note of a launch: {error}; `up` names its folder") from error
-
-
-def running_launches() -> list[Path]:
-    """Socket folders of the launches that run, the newest first."""
-    found: list[tuple[int, Path]] = []
-    for folder in own_folders():
-        try:
-            stat = folder.stat()
-            if stat.st_uid == os.getuid() and is_in_use(folder) and (folder / STATUS_SOCKET).exists():
-                found.append((stat.st_ctime_ns, folder))
-        except OSError:  # it has just ended, or is another user's
-            continue
-    return [folder for _, folder in sorted(found, reverse=True)]
-
-
-def launch_folder(place: str) -> Path:
-    """The socket folder of a running launch; an empty place stands for the one launch that runs. Raises TransportError:
-    none runs, several do, or the folder is not that of a launch."""
-    if place:
-        if not (Path(place) / STATUS_SOCKET).exists():
-            raise TransportError(f"{place}: no socket folder of a launch that runs; `up` names its own as it starts")
-        return Path(place).absolute()
-    folders = running_launches()
-    if not folders:
-        raise TransportError("no launch runs here; `semantic-mapper up LAUNCH.toml` starts one")
-    if len(folders) > 1:
-        raise TransportError(f"several launches run here; name one by its folder: {', '.join(map(str, folders))}")
-    return folders[0]
-
-
-def socket_in_launch(place: str, name: str) -> str:
-    """The endpoint ``name`` of a running launch, which is named as for ``launch_folder``; endpoints stay as they are.
-    Raises TransportError: as of ``launch_folder``."""
-    return place if "://" in place else f"ipc://{launch_folder(place)}/{name}"
-
-
-def map_endpoint(place: str) -> str:
-    """Where the mapper answers that a person means by a place; empty for anything else, such as a saved map.
-
-    A place is an endpoint, ``live`` for the one launch that runs, or the socket folder of a launch. Raises
-    TransportError: there is no such socket, no launch runs, or several do.
-    """
-    if place == LIVE or (Path(place) / STATUS_SOCKET).exists():
-        place = socket_in_launch("" if place == LIVE else place, QUERY_SOCKET)
-    transport, separator, path = place.partition("://")
-    if transport == "ipc" and path and not path.startswith("@") and not Path(path).exists():
-        raise TransportError(  # at once, rather than after several attempts
-            f"{place}: there is no such socket; does the mapper run? `up` names the socket folder of its launch as "
-            "it starts, and its mapper answers at ipc://FOLDER/query"
-        )
-    return place if separator else ""
 
 
 def node_endpoints(folder: Path) -> dict[str, str]:

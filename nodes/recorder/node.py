@@ -13,7 +13,6 @@ import msgspec
 import structlog
 
 from semantic_mapper.errors import CodecError, LogError
-from semantic_mapper.nodes.launcher.running import NOTE as LAUNCH
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.publishing import PartStatus, StatusReport
@@ -24,6 +23,7 @@ from semantic_mapper.replay.log.recording import Recording, RecordingRules, make
 from semantic_mapper.replay.log.sequence import parts_on_disk
 from semantic_mapper.transport.codec import decode_as, read_envelope, repack_rgb
 from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.launches import NOTE as LAUNCH
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo, parse_topic
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics

@@ -30,7 +30,7 @@ from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.liveness import end_with_launcher
 from semantic_mapper.nodes.local_server import HOST, LocalServer, open_browser
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.process_folder import OwnFolder
+from semantic_mapper.transport.process_folder import OwnFolder
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

@@ -22,7 +22,6 @@ from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.rerun_log import RerunLog
-from semantic_mapper.transport.keys import ServerIdentity
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
@@ -42,10 +41,12 @@ _log = structlog.get_logger(__name__)
 class Live:
     """Where a running system is listened to."""
 
-    query: str  # where its mapper answers questions
+    mapper: str  # its place, as of ``MapClient``
     # endpoints of cameras and mappers, whatever else is among them; none shows the map alone
     nodes: tuple[str, ...] = ()
-    identity: ServerIdentity | None = None  # of a mapper that has keys
+    # server, keys: Of a mapper on another machine, as of ``MapClient``.
+    server: str = ""
+    keys: Path | None = None
     streams: int = 1  # how many of the nodes are cameras; it is over when all of their streams have ended
 
 
@@ -98,7 +99,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
     The mapper is queried first, and waited for: a camera that waits for its listeners would else count this one in.
     ``begin`` is called once the endpoint is known to be one (else ``TransportError``), ``tell`` with lines of progress.
     """
-    with MapClient(live.query, identity=live.identity, attempts=1) as client:
+    with MapClient(live.mapper, server=live.server, keys=live.keys, attempts=1) as client:
         stream = begin()
         snapshot = _first_snapshot(client, stop, tell)
         if snapshot is None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zmq
@@ -30,7 +31,7 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.queries.questions import decode_question
 from semantic_mapper.transport.codec import decode, encode, encode_frame, unpack_parts
-from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
+from semantic_mapper.transport.keys import allow, make_keys
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
@@ -206,13 +207,15 @@ def wrong_keys(rounds: int) -> Iterator[Outcome]:
             allow(keys.folder, "robot", robot.public.decode())
         voxel_map = VoxelMap(VoxelMapConfig(), ROOMS)
         service = stack.enter_context(QueryService("tcp://127.0.0.1:*", voxel_map, keys=robot))
-        with MapClient(service.endpoint, identity=ServerIdentity(desk, "robot"), timeout_s=ANSWER_S) as client:
+        with MapClient(service.endpoint, server="robot", keys=desk.folder, timeout_s=ANSWER_S) as client:
             map_id = client.info().map_id  # compiled
         files = len(os.listdir("/proc/self/fd"))
         for _ in range(rounds):
-            let_in = sum(_is_answered(service.endpoint, who) for who in (ServerIdentity(stranger, "robot"), None))
+            let_in = sum(
+                _is_answered(service.endpoint, **who) for who in ({"server": "robot", "keys": stranger.folder}, {})
+            )
             began_s = time.monotonic()
-            with MapClient(service.endpoint, identity=ServerIdentity(desk, "robot"), timeout_s=ANSWER_S) as client:
+            with MapClient(service.endpoint, server="robot", keys=desk.folder, timeout_s=ANSWER_S) as client:
                 right = client.info().map_id == map_id
             back_s = time.monotonic() - began_s
             left = _files_left(files)
@@ -232,9 +235,9 @@ def _files_left(before: int, within_s: float = 2.0) -> int:
     return max(0, left)
 
 
-def _is_answered(endpoint: str, identity: ServerIdentity | None) -> bool:
+def _is_answered(endpoint: str, **who: Any) -> bool:
     try:
-        with MapClient(endpoint, identity=identity, timeout_s=0.5) as client:
+        with MapClient(endpoint, timeout_s=0.5, **who) as client:
             client.info()
     except (TransportError, SemanticMapperError):
         return False

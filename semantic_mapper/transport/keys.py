@@ -65,6 +65,12 @@ class ServerIdentity:
     server: str = ""  # name of the server among the peers; empty = it has the very same keys
 
 
+def server_identity(server: str = "", keys: Path | None = None) -> ServerIdentity | None:
+    """Whom to expect: a peer by its name, or, where none is named, who has the very same keys; ``keys`` is their folder
+    (by default this user's). None where neither is given: anybody. Raises TransportError: as of ``load_keys``."""
+    return ServerIdentity(load_keys(keys or user_key_folder()), server) if server or keys else None
+
+
 def make_keys(folder: Path) -> Keys:
     """Make new keys for this machine; ``TransportError`` where there are some, or the folder cannot be written."""
     if (folder / f"{_OWN}.key_secret").exists():

@@ -95,5 +95,5 @@ WITH_METRES: tuple[Callable[[MapSnapshot], object], ...] = (
 @pytest.mark.parametrize("query", WITH_METRES)
 def test_metres_are_refused_where_the_scale_is_unknown(query: Callable[[MapSnapshot], object]) -> None:
     query(whole())
-    with pytest.raises(MapError, match=r"the scale is unknown; give a scale.*--distance"):
+    with pytest.raises(MapError, match=r"the scale is unknown; .semantic-mapper scale"):
         query(dataclasses.replace(whole(), scale_known=False))

@@ -9,7 +9,7 @@ import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.keys import ServerIdentity, load_keys
+from semantic_mapper.transport.keys import load_keys
 from tests.nodes.mapper.test_query_service import answering
 from tests.nodes.support import refused, run_ok
 from tests.queries.scene import whole_map
@@ -29,10 +29,9 @@ def test_a_map_is_asked_from_another_machine(tmp_path: Path) -> None:
     assert shown == {"folder": str(robot), "public": public[robot], "peers": {"desk": public[desk]}}
     assert public[robot] in keys("show", "--keys", desk)
 
-    identity = ServerIdentity(load_keys(desk), "robot")
     with answering("tcp://0.0.0.0:*", whole_map(), load_keys(robot)) as service:
         endpoint = service.endpoint.replace("0.0.0.0", "127.0.0.1")
-        with MapClient(endpoint, timeout_s=60, identity=identity) as client:
+        with MapClient(endpoint, timeout_s=60, server="robot", keys=desk) as client:
             assert client.info().blocks == whole_map().block_count
         with MapClient(endpoint, timeout_s=0.2, attempts=1) as clear, pytest.raises(TransportError, match="no answer"):
             clear.info()

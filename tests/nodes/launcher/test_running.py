@@ -1,4 +1,4 @@
-"""Which launch is meant, what is said where nobody can answer, and what `view --status` makes of statuses."""
+"""What is said where nobody can answer, and what `view --status` makes of statuses."""
 
 from __future__ import annotations
 
@@ -8,18 +8,9 @@ from unittest.mock import Mock
 import pytest
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.launcher import running
-from semantic_mapper.nodes.launcher.running import LaunchView, launch_folder
+from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.transport.messages import Status
 from tests.nodes.support import refused
-
-
-def test_launches_that_could_be_meant_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for launches, says in (([], "no launch runs here"), ([tmp_path / "a", tmp_path / "b"], f"{tmp_path}/b")):
-        monkeypatch.setattr(running, "running_launches", lambda found=launches: found)
-        with pytest.raises(TransportError, match=says):
-            launch_folder("")
 
 
 def test_a_mapper_without_socket_is_not_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,13 +20,12 @@ import pytest
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.nodes.cli.info import describe_log
-from semantic_mapper.nodes.launcher.launch_file import NodeEntry
-from semantic_mapper.nodes.launcher.running import NOTE, LaunchNote, read_launch_note
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.launches import NOTE, LaunchedNode, LaunchNote, read_launch_note
 from semantic_mapper.transport.messages import EndOfStream, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from tests.nodes.mapper.test_query_service import a_folder
@@ -112,7 +111,7 @@ def sockets() -> Iterator[Path]:
 
 
 def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path, sockets: Path) -> None:
-    note = LaunchNote("kitchen.toml", (NodeEntry("camera", "camera", {"log": "x"}),))
+    note = LaunchNote("kitchen.toml", (LaunchedNode("camera", "camera", {"log": "x"}),))
     (sockets / NOTE).write_bytes(msgspec.json.encode(note))
     with streaming(tmp_path, sockets, split_mb=0.02, rgb="jpeg", jpeg_quality=90, reserve_mb=0) as stream:
         stream.publish(*range(10), *range(12, 30))

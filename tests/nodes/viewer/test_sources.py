@@ -31,7 +31,7 @@ from semantic_mapper.queries.snapshot import BlockAges, MapMirror
 from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
-from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
+from semantic_mapper.transport.keys import allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import Publisher
 from tests.nodes.foxglove.robot import update_for
@@ -156,7 +156,7 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
         live = Live(f"ipc://{folder}/query", (f"ipc://{folder}/camera",))
         with Publisher(live.nodes[0]) as publisher, watching_live(live, tmp_path / "live.rrd", told):
             assert not publisher.subscribers("frame"), "before its mapper is there it is no listener"
-            with answering(live.query, whole_map()):
+            with answering(live.mapper, whole_map()):
                 assert eventually(lambda: publisher.subscribers("frame") > 0, WARM_S)
                 for frame in frames:
                     publisher.publish(encode_frame(frame))
@@ -179,7 +179,7 @@ def test_a_map_on_another_machine_is_shown_to_who_has_a_key_and_a_saved_one_with
     allow(robot.folder, "desk", desk.public.decode())
     allow(desk.folder, "robot", robot.public.decode())
     with answering("tcp://127.0.0.1:*", whole_map(), robot) as service:
-        live = Live(service.endpoint, (), ServerIdentity(desk, "robot"))
+        live = Live(service.endpoint, (), "robot", desk.folder)
         with watching_live(live, tmp_path / "live.rrd", []) as stop:
             assert eventually(lambda: service.answered >= 4, WARM_S)
             stop.signum = signal.SIGTERM

@@ -13,14 +13,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import structlog
 from filelock import FileLock, Timeout
+
+from semantic_mapper.log_events import get_logger
 
 PREFIX = "semantic-mapper-"
 _LOCK = "in-use.lock"  # held by the process that has made the folder; the kernel frees it when that dies
 _ASK_S = 0.05  # another process may be asking, too
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class OwnFolder:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.nodes.process_folder import OwnFolder, is_in_use, sweep
+from semantic_mapper.transport.process_folder import OwnFolder, is_in_use, sweep
 
 
 @pytest.fixture
