@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from semantic_mapper.config import load_config
-from semantic_mapper.errors import EmptyMapError, LogError, SemanticMapperError
+from semantic_mapper.errors import EmptyMapError, SemanticMapperError
 from semantic_mapper.nodes.cli.eval import print_results
 from semantic_mapper.nodes.cli.verb import complete, must_be_there, set_option, verb, wrong_usage
 from semantic_mapper.nodes.console import Output

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semantic_mapper.errors import MapError
+from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from tests.queries.scene import BALL, BOX, CUP, FLOOR, LABELS, RADIUS, TABLE, surface_of, whole
