@@ -8,10 +8,7 @@ import numpy as np
 
 from semantic_mapper.depth_from_motion.estimate import TOLERANCE, find_agreement, relax_membrane
 from semantic_mapper.depth_from_motion.sweep import (
-    EDGE_GRAY,
     HINT_COST,
-    LARGE_STEP,
-    SMALL_STEP,
     UNSEEN_COST,
     inverse_depths,
     sweep_and_match,
@@ -19,7 +16,6 @@ from semantic_mapper.depth_from_motion.sweep import (
 from semantic_mapper.depth_from_motion.views import (
     DepthEstimate,
     PreparedView,
-    census_transform,
     enlarge_estimate,
     prepare_view,
 )
@@ -33,18 +29,6 @@ def views() -> list[PreparedView]:
     return [
         prepare_view(plane_frame(x, 0.3 * x, turn=0.2 * x, seq=k)[0], 32) for k, x in enumerate((0, 0.15, 0.3, -0.2))
     ]
-
-
-def plain_census(gray: np.ndarray, spacing: int) -> np.ndarray:
-    padded = np.pad(gray, 2 * spacing, mode="edge")
-    out = np.zeros(gray.shape, np.int32)
-    height, width = gray.shape
-    for j in range(5):
-        for i in range(5):
-            if (i, j) != (2, 2):
-                other = padded[j * spacing : j * spacing + height, i * spacing : i * spacing + width]
-                out = out << 1 | (other < gray)
-    return out
 
 
 def plain_cost(reference: PreparedView, sources: list[PreparedView], hint: DepthEstimate | None) -> np.ndarray:
@@ -78,32 +62,6 @@ def plain_cost(reference: PreparedView, sources: list[PreparedView], hint: Depth
     return cost
 
 
-def plain_path(cost: np.ndarray, gray: np.ndarray, dy: int, dx: int) -> np.ndarray:
-    """Costs (h, w, D) along the path that goes on by (dy, dx)."""
-    height, width, planes = cost.shape
-    out = cost.astype(int).copy()
-    rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
-    columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
-    for y in rows:
-        for x in columns:
-            j, i = y - dy, x - dx
-            if not (0 <= j < height and 0 <= i < width):
-                continue
-            large = max(LARGE_STEP / (1 + abs(int(gray[y, x]) - int(gray[j, i])) / EDGE_GRAY), 2 * SMALL_STEP)
-            before = out[j, i]
-            padded = np.pad(before, 1, constant_values=10**6)
-            steps = np.minimum(padded[:-2], padded[2:]) + SMALL_STEP
-            out[y, x] += np.minimum(np.minimum(before, steps), before.min() + int(large)) - before.min()
-    assert planes == out.shape[2]
-    return out
-
-
-def test_census_compares_each_pixel_with_those_around_it() -> None:
-    gray = np.random.default_rng(1).integers(0, 6, (13, 17)).astype(np.uint8)
-    for spacing in (1, 2):
-        np.testing.assert_array_equal(census_transform(gray, spacing), plain_census(gray, spacing))
-
-
 def test_cost_is_the_sum_of_the_two_best_sources_and_of_the_distance_from_a_hint() -> None:
     reference, *sources = views()
     size = reference.gray.shape
@@ -113,14 +71,6 @@ def test_cost_is_the_sum_of_the_two_best_sources_and_of_the_distance_from_a_hint
         expected = plain_cost(reference, sources[:count], given)
         # float32 puts a few points into the next pixel; a hint's cost is a fraction
         assert (np.abs(swept.cost.astype(int) - expected) <= (given is not None)).mean() > 0.999
-
-
-def test_costs_are_summed_along_eight_paths() -> None:
-    reference, *sources = views()
-    swept = sweep_and_match(reference, sources, PLANES, None)
-    ways = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
-    expected = sum(plain_path(swept.cost, reference.gray, *way) for way in ways)
-    np.testing.assert_array_equal(swept.path_sum, expected)
 
 
 def test_the_best_plane_lies_at_the_bottom_of_a_parabola() -> None:

@@ -8,11 +8,7 @@ from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.render import (
-    COLOUR_STEP,
-    DEPTH_STEP,
-    UNSURE,
     View,
-    fill_between_rays,
     render_sparse_view,
     render_view,
 )
@@ -91,56 +87,3 @@ def test_images_of_another_size_than_the_view_are_refused():
         sparse(Halves(), np.ones((30, 20), np.float32))
     with pytest.raises(ShapeError, match="view rgb"):
         sparse(Halves(), rgb=np.zeros((60, 40, 3), np.uint8))
-
-
-def filled(step: int, p: np.ndarray, known: np.ndarray, depth: np.ndarray, prior: np.ndarray, rgb: np.ndarray):
-    """The rule of ``fill_between_rays``, all pixels at once: new p, known, depth, uncertainty."""
-    height, width = depth.shape
-    v, u = np.mgrid[0:height, 0:width]
-
-    def on_grid(place: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-        after = -(-place // step) * step
-        return place // step * step, np.where(after < size, after, after - step)
-
-    corners = [(j, i) for j in on_grid(v, height) for i in on_grid(u, width)]
-    p4, known4, depth4 = (np.stack([image[at] for at in corners]) for image in (p, known, depth))
-    prior4, rgb4 = (np.stack([image[at] for at in corners]).astype(float) for image in (prior, rgb))
-    count = known4.sum(0)
-    mean = (p4 * known4[..., None]).sum(0) / np.maximum(count, 1)[..., None]
-    top = np.where(known4, p4.argmax(3), -1)
-    differs, unsure = (top != top[0]).any(0), 1 - mean.max(2)
-    jump = np.abs(prior4.mean(0) - prior) > DEPTH_STEP * prior
-    edge = np.abs(rgb4.mean(0) - rgb).sum(2)
-    uncertainty = 2.0 * differs + jump + np.minimum(edge / 255, 1) + unsure
-    uncertainty[~(differs | jump | (edge > COLOUR_STEP) | (unsure > UNSURE))] = 0
-    between = (v % (step // 2) == 0) & (u % (step // 2) == 0) & ((v % step > 0) | (u % step > 0))
-    some = between & (count > 0)
-    mean_depth = (depth4 * known4).sum(0) / np.maximum(count, 1)
-    return (
-        np.where(some[..., None], mean, p),
-        known | some,
-        np.where(some, mean_depth, depth),
-        np.where(between, uncertainty, 0),
-    )
-
-
-@pytest.mark.parametrize("step", [2, 4])
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (12, 16), (13, 19), (15, 18)])
-@pytest.mark.parametrize("classes", [1, 3, 40])
-def test_pixels_between_rays_hold_the_mean_of_those_round_them(step: int, size: tuple[int, int], classes: int):
-    rng = np.random.default_rng(step + 10 * sum(size) + classes)
-    p = rng.random((*size, classes), np.float32) ** 8
-    p /= p.sum(2, keepdims=True)
-    grid = np.zeros(size, bool)
-    grid[::step, ::step] = True
-    known = grid & (rng.random(size) < 0.8)
-    p[~grid] = 0
-    depth = np.where(known, 1 + rng.random(size, np.float32), 0).astype(np.float32)
-    prior = (1 + rng.choice([0.01, 0.2]) * rng.random(size)).astype(np.float32)
-    rgb = rng.integers(0, 40, (*size, 3), dtype=np.uint8)
-    expected = filled(step, p, known, depth, prior, rgb)
-    uncertainty = np.zeros(size, np.float32)
-    lines = -(-size[0] // (step // 2))
-    fill_between_rays(lines, step, p, known, depth, prior, rgb, uncertainty, DEPTH_STEP, COLOUR_STEP, UNSURE)
-    for got, twin in zip((p, known, depth, uncertainty), expected, strict=True):
-        np.testing.assert_allclose(got, twin, atol=1e-6)

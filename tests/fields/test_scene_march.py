@@ -18,7 +18,6 @@ from semantic_mapper.fields.scene.march import (
     RayResults,
     SampleLists,
     TargetArrays,
-    adam_grid,
     add_total_variation,
     gather,
     march,
@@ -161,23 +160,6 @@ def test_the_photometric_step_has_the_gradients_of_plain_torch() -> None:
     assert leaf.grad is not None and sky.grad is not None
     torch.testing.assert_close(torch.from_numpy(gradient), leaf.grad, atol=1e-6, rtol=1e-3)
     torch.testing.assert_close(torch.from_numpy(results.sky_gradient), sky.grad, atol=1e-6, rtol=1e-3)
-
-
-def test_adam_steps_as_torch_does_and_leaves_what_has_no_gradient() -> None:
-    values, _ = random_grid()
-    gradient = np.random.default_rng(0).normal(size=(3, *values.shape)).astype(np.float32)
-    gradient[:, :3] = 0
-    stepped, (first, second) = values.numpy().copy(), np.zeros((2, *values.shape), np.float32)
-    leaf = values.clone().requires_grad_()
-    optimiser = torch.optim.Adam([leaf], 0.1, betas=(0.9, 0.99), eps=1e-15)
-    for step, g in enumerate(gradient, 1):
-        leaf.grad = torch.from_numpy(g.copy())
-        optimiser.step()
-        rate = np.ones(SHAPE, np.float32)
-        adam_grid(len(g), stepped, g, first, second, rate, 0.1, 0.1, 0.9, 0.99, 1 - 0.9**step, 1 - 0.99**step)
-        assert not g.any()
-    torch.testing.assert_close(torch.from_numpy(stepped), leaf.detach(), atol=1e-5, rtol=1e-5)
-    assert np.array_equal(stepped[:3], values.numpy()[:3])
 
 
 def test_total_variation_has_the_gradient_of_the_huber_loss_of_neighbours() -> None:

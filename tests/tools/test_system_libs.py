@@ -25,33 +25,6 @@ def script(tmp_path: Path) -> ModuleType:
     return module
 
 
-@pytest.fixture
-def package(tmp_path: Path) -> Path:
-    """Folder ``deb`` with a package that holds a library behind a link, as Debian's do."""
-    if not shutil.which("dpkg-deb"):
-        pytest.skip("no dpkg-deb on this system")
-    tree = tmp_path / "build"
-    libraries = tree / "usr" / "lib" / "some-arch"
-    libraries.mkdir(parents=True)
-    (libraries / "libfoo.so.1.2.3").write_bytes(b"library")
-    (libraries / "libfoo.so.1").symlink_to("libfoo.so.1.2.3")
-    (tree / "DEBIAN").mkdir()
-    (tree / "DEBIAN" / "control").write_text(
-        "Package: libfoo1\nVersion: 1.2.3\nArchitecture: all\nMaintainer: nobody <n@example.org>\nDescription: test\n"
-    )
-    (tmp_path / "deb").mkdir()
-    target = tmp_path / "deb" / "libfoo1_1.2.3_all.deb"
-    subprocess.run(["dpkg-deb", "--build", "--root-owner-group", tree, target], check=True, capture_output=True)
-    return tmp_path
-
-
-def test_a_library_is_unpacked_under_its_soname(script: ModuleType, package: Path) -> None:
-    assert script.unpack("libfoo.so.1", "libfoo1", package) == ""
-    assert [p.name for p in script.FOLDER.iterdir()] == ["libfoo.so.1"]
-    assert not (script.FOLDER / "libfoo.so.1").is_symlink()
-    assert (script.FOLDER / "libfoo.so.1").read_bytes() == b"library"
-
-
 def test_open3d_loads_after_set_up(script: ModuleType) -> None:
     script.FOLDER = Path(sys.prefix) / "syslibs"
     assert script.first_missing() is None
