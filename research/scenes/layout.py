@@ -7,7 +7,7 @@ import numpy as np
 from research.scenes.furniture import FURNITURE
 from research.scenes.materials import Palette
 from research.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z, scaled
-from research.scenes.shell import Shell, build_shell, wall_pose
+from research.scenes.shell import build_shell, wall_pose
 from semantic_mapper.types import Float64
 
 _GAP_M = 0.015  # between two pieces, and between a piece and the wall behind it
@@ -25,7 +25,6 @@ class Layout:
         palette: The room's materials.
         wet: A bathroom, with tiles.
         variety: Draws what only varied rooms have; None: not one of them.
-        shell: Floor, ceiling and walls; None: drawn.
     """
 
     def __init__(
@@ -36,7 +35,6 @@ class Layout:
         *,
         wet: bool = False,
         variety: np.random.Generator | None = None,
-        shell: Shell | None = None,
     ) -> None:
         self.size_m = size_m
         self.rng = rng
@@ -48,12 +46,12 @@ class Layout:
         self._tops: list[tuple[Top, float, Float64]] = []  # with yaw and position of the piece they belong to
         self._low, self._high = np.zeros((0, 3)), np.zeros((0, 3))  # of all parts that stand
         self._free_low, self._free_high = np.zeros((0, 3)), np.zeros((0, 3))  # zones to keep free
-        shell = shell or build_shell(size_m, rng, palette, wet=wet, variety=variety)
+        shell = build_shell(size_m, rng, palette, wet=wet, variety=variety)
         self.groups.extend(shell.groups)
         self.far_lamp = shell.lamp
         self.has_opening = shell.free is not None
         if shell.free is not None:
-            self._free_low, self._free_high = np.atleast_2d(shell.free[0]), np.atleast_2d(shell.free[1])
+            self._free_low, self._free_high = (corner[None] for corner in shell.free)
 
     def make(self, name: str, rng: np.random.Generator | None = None) -> Assembly:
         """A specimen of a piece, drawn by ``rng`` or else the room's; in a varied room, each kind has its own size."""

@@ -78,11 +78,6 @@ class MovingView:
     thing: UInt8
     moving: Bool
 
-    @property
-    def movable(self) -> Bool:
-        """(H, W) pixels of things that move at any time."""
-        return self.thing > 0
-
 
 def make_moving_room(
     seed: int,

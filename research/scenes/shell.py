@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,30 +25,12 @@ class Shell:
     Args:
         groups: Parts in world coordinates.
         lamp: (3,) a lamp in the next room; None without an opening.
-        free: Lower and upper corner (3,) of the space to leave before the opening, or (K, 3) of K; None without one.
+        free: Lower and upper corner (3,) of the space to leave before the opening; None without one.
     """
 
     groups: list[list[Part]]
     lamp: Float64 | None = None
     free: tuple[Float64, Float64] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Doorway:
-    """A hole through one wall of a room of a storey, see ``storey``; along the wall as in ``wall_pose``.
-
-    Args:
-        wall: Which one.
-        along: Of its middle, metres.
-        width, height: Metres.
-        framed: Whether its frame and leaf belong to this room; the leaf stands open into the next one.
-    """
-
-    wall: int
-    along: float
-    width: float
-    height: float
-    framed: bool
 
 
 @dataclass(slots=True)
@@ -114,49 +95,6 @@ def build_shell(
     low, high = zone.min(0), zone.max(0)
     low[2], high[2] = 0.05, 2.35
     return Shell(groups, lamp, (low, high))
-
-
-def shell_between(
-    size_m: tuple[float, float, float],
-    doors: Sequence[Doorway],
-    half_m: float,
-    rng: np.random.Generator,
-    palette: Palette,
-    *,
-    wet: bool = False,
-) -> Shell:
-    """The shell of a room among others: its half, ``half_m`` thick, of walls that it shares with its neighbours."""
-    w, d, h = size_m
-    floor = palette.pick(rng, *(("tile",) if wet else _FLOORS), role="floor")
-    wall, ceiling = palette.pick(rng, *_WALLS), palette.pick(rng, "wallpaint", "paint")
-    groups: list[list[Part]] = []
-    for label, material, z in (("floor", floor, -0.05), ("ceiling", ceiling, h + 0.05)):
-        slab = Assembly(label)
-        slab.box(material, (w / 2, d / 2, z), (w + 2 * half_m, d + 2 * half_m, 0.1))
-        groups.append(slab.parts)
-    low, high = np.zeros((0, 3)), np.zeros((0, 3))
-    frames: list[list[Part]] = []
-    for k in range(4):
-        pose, length = wall_pose(size_m, k, 0.0), size_m[k % 2]
-        piece, start = Assembly("wall"), -half_m
-        own = sorted((door for door in doors if door.wall == k), key=lambda door: door.along)
-        for door in own:
-            x0, x1 = door.along - door.width / 2, door.along + door.width / 2
-            piece.box(wall, ((start + x0) / 2, -half_m / 2, h / 2), (x0 - start, half_m, h))
-            piece.box(wall, (door.along, -half_m / 2, (door.height + h) / 2), (door.width, half_m, h - door.height))
-            start = x1
-            zone = np.array([(x, y, 0.0) for x in (x0 - 0.05, x1 + 0.05) for y in (0.0, 0.9)])
-            zone = zone @ rotation_z(pose[0]).T + pose[1]
-            low = np.vstack((low, [*zone.min(0)[:2], 0.05]))
-            high = np.vstack((high, [*zone.max(0)[:2], 2.35]))
-            if door.framed:
-                hinge = 1 if rng.uniform() < 0.5 else -1
-                opening = _Opening(k, x0, x1, door.height, x0, x1, 1.0, bool(rng.uniform() < 0.5), hinge)
-                frames.append(place_parts(_door_frame(opening, rng, palette), *pose))
-        end = length + half_m
-        piece.box(wall, ((start + end) / 2, -half_m / 2, h / 2), (end - start, half_m, h))
-        groups.append(place_parts(piece, *pose))
-    return Shell(groups + frames, free=(low, high) if doors else None)
 
 
 def _draw_opening(size_m: tuple[float, float, float], rng: np.random.Generator) -> _Opening:

@@ -18,7 +18,6 @@ from research.scenes.aerial.views import aerial_camera, aerial_views
 from research.scenes.building import building_walk
 from research.scenes.klevr import klevr_camera, klevr_views
 from research.scenes.moving import make_moving_room, moving_views
-from research.scenes.storey import make_storey, survey_poses, survey_views
 from research.scenes.streets.views import street_camera, street_views
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
@@ -38,10 +37,6 @@ def pictures(kind: str) -> Iterator[Picture]:
         visit = next(iter(building_walk(2, 4, CAMERA, hz=2.0)))
         for frame in islice(visit.frames, 2):
             yield frame.rgb, frame.label, frame.depth_m
-    elif kind == "storey":
-        storey = make_storey(200_001)
-        for view in survey_views(storey, survey_poses(storey)[:2], CAMERA):
-            yield view.rgb, view.label, view.depth_m
     elif kind == "moving":
         for view in islice(moving_views(make_moving_room(TEST_SEEDS[0], 4), CAMERA), 2):
             yield view.view.rendered.rgb, view.view.rendered.label, view.view.rendered.depth_m
@@ -69,7 +64,7 @@ def observe(kind: str) -> list[dict[str, object]]:
     return found
 
 
-KINDS = ("room", "varied", "people", "noisy", "building", "storey", "moving", "klevr", "aerial", "streets")
+KINDS = ("room", "varied", "people", "noisy", "building", "moving", "klevr", "aerial", "streets")
 
 
 @pytest.mark.parametrize("kind", KINDS)
