@@ -24,13 +24,15 @@ def levels_of(frame: PosedFrame) -> tuple[Level, ...]:
     return make_levels(thin_depth(frame.depth_m, 1, 6.0), INTRINSICS)
 
 
-def test_alignment_finds_the_way_between_two_views() -> None:
+def test_alignment_finds_the_way_between_two_views_past_what_does_not_fit() -> None:
     a, _, b = walk_frames(7, 3, INTRINSICS)
+    assert b.depth_m is not None
+    b.depth_m[40:70, 60:100] -= 0.06  # near enough to count, were it not for its distance beyond the noise
     target = Target(levels_of(a), a.T_world_camera)
     guess = b.T_world_camera @ make_pose((0.01, -0.015, 0.01), (0.02, -0.01, 0.02))
     found = align(levels_of(b), [target], guess)
     assert found is not None
-    assert np.linalg.norm(found[:3, 3] - b.T_world_camera[:3, 3]) < 0.005
+    assert np.linalg.norm(found[:3, 3] - b.T_world_camera[:3, 3]) < 0.002
     assert np.allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
     before, after = (fit(levels_of(b), target, T) for T in (guess, found))
     assert after.rmse_m < 0.5 * before.rmse_m and after.fitness > 0.9 and after.overlap > 0.6

@@ -9,11 +9,11 @@ from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.geometry import invert_pose, make_pose
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping import merge
-from semantic_mapper.mapping.blocks import BlockValues
+from semantic_mapper.mapping.blocks import BlockValues, empty_blocks
 from semantic_mapper.mapping.fusion import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64
-from tests.mapping.grids import random_grid
+from tests.mapping.grids import corners, random_grid
 from tests.mapping.rendered_views import LABELS, around, frame, small_map, sphere_depth, sure
 from tests.mapping.test_voxel_map import CENTER, same
 
@@ -97,6 +97,43 @@ def test_maps_that_do_not_fit_are_refused(halves: tuple[VoxelMap, VoxelMap]) -> 
         a.merged(a, np.diag((1.0, 1.0, -1.0, 1.0)))
     with pytest.raises(MapError, match="max_blocks"):
         small_map(max_blocks=100).merged(a, np.eye(4))
+
+
+def test_resampled_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng)
+    T = turned((20.0, -35.0, 50.0), (0.6, -2.3, 1.9))
+    R, t, sums = np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), buffers.evidence
+    keys = np.array([[0, 0, 0], [-1, 0, -1]], np.int32)
+    moved = empty_blocks(2, 4)
+    merge._resample_blocks(2, keys, R, t, index, buffers, moved)
+    assert (moved.weight > 0).mean() > 0.3 and (moved.votes > 0).mean() > 0.2
+    for n, voxel in np.ndindex(2, 512):
+        p = R @ (keys[n] * 8 + np.array([voxel % 8, voxel // 8 % 8, voxel // 64]) - t)
+        around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-6]
+        seen = [(f, at) for f, at in around if buffers.weight[at] > 0]
+        total = 1.0
+        values = [buffers.tsdf[at] for _, at in seen]
+        if values and max(values) - min(values) > 0.95:  # a depth edge: the nearest voxel alone
+            around = seen = [max(seen, key=lambda one: one[0])]
+            total = seen[0][0]
+        fraction = sum(f for f, _ in seen)
+        if around and fraction >= 0.5 * total:
+            mean = {
+                name: sum(f * getattr(buffers, name)[at] for f, at in seen) / fraction
+                for name in ("weight", "tsdf", "color")
+            }
+        else:
+            mean = {"weight": 0.0, "tsdf": 0.0, "color": np.zeros(3)}
+        for name, value in mean.items():
+            np.testing.assert_allclose(getattr(moved, name)[n, voxel], value, rtol=1e-5, atol=1e-6)
+        voted = [(f, at) for f, at in around if buffers.votes[at] > 0]
+        fraction = sum(f for f, _ in voted)
+        votes, said = 0.0, np.zeros(4)
+        if voted and fraction >= 0.5 * total:
+            votes = sum(f * buffers.votes[at] for f, at in voted) / fraction
+            said = sum(f * sums[at] for f, at in voted) / fraction
+        np.testing.assert_allclose(moved.votes[n, voxel], votes, rtol=1e-5)
+        np.testing.assert_allclose(moved.evidence[n, voxel], said, rtol=1e-5)
 
 
 def test_added_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> None:
