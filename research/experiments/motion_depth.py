@@ -1,6 +1,6 @@
 """Depth computed from posed pictures, against a depth sensor or exact depth; one-sided and two-sided, in CPU time.
 
-Example: python -m research.experiments.motion_depth kitchen.mcap --every 2 --picture depth.png
+Example: python -m research.experiments.motion_depth kitchen.mcap --every 2
          python -m research.experiments.motion_depth rooms --rooms 8
 """
 
@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import msgspec
 import numpy as np
 import torch
@@ -26,9 +25,8 @@ from semantic_mapper.depth_from_motion.estimate import estimate_depth
 from semantic_mapper.depth_from_motion.stream import DepthFromMotion, choose_sources
 from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
 from semantic_mapper.depth_from_motion.views import enlarge_estimate, prepare_view
-from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 ROOM_WIDTH, ROOM_FOCAL = 320, 882.5 / 1280  # an OAK-D's lens
 SIGMAS = (1.0, 2.0)  # errors within these many sigma are counted; 68 and 95 % where the spread is Gaussian
@@ -138,27 +136,6 @@ def report(results: Sequence[Result]) -> dict[str, Any]:
     return {"frames": len(rows), "asked": asked, **mean, "cpu_ms": cpu_ms, "sigma_then_error": calibration(results)}
 
 
-def picture(result: Result, rows: int = 4) -> UInt8:
-    """Image, truth, depth, spread and error of a few frames, in one scale of metres a row."""
-    out: list[UInt8] = []
-    chosen = np.linspace(0, len(result.frames) - 1, rows + 1)[1:].round().astype(int)
-    for frame, truth in (result.frames[k] for k in chosen):
-        assert frame.depth_m is not None and frame.depth_sigma_m is not None
-        far = float(np.quantile(truth[truth > 0], 0.98)) * 1.1
-        off = np.where(truth > 0, np.abs(frame.depth_m - truth) / np.maximum(truth, NEAREST_TRUTH_M), 0)
-        spread = frame.depth_sigma_m / np.maximum(frame.depth_m, NEAREST_TRUTH_M)
-        panels = [frame.rgb, _coloured(truth / far), _coloured(frame.depth_m / far)]
-        panels += [_coloured(spread / 0.2), _coloured(off / 0.2)]
-        small = [cv2.resize(panel, (320, 240), interpolation=cv2.INTER_AREA) for panel in panels]
-        out.append(np.asarray(np.hstack(small), np.uint8))
-    return np.asarray(np.vstack(out), np.uint8)
-
-
-def _coloured(value: Any) -> UInt8:
-    shown = cv2.applyColorMap((255 * np.clip(value, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)
-    return np.asarray(shown[..., ::-1], np.uint8)
-
-
 def main() -> None:
     """Run it, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,7 +146,6 @@ def main() -> None:
     parser.add_argument("--max-frames", type=int, default=0, help="of a log, 0 = all; of a room, 24 by default")
     parser.add_argument("--rooms", type=int, default=8, help="test rooms")
     parser.add_argument("--step", type=float, default=0.08, help="metres between two frames of a room")
-    parser.add_argument("--picture", type=Path, help="PNG of image, truth, depth, spread and error of some frames")
     parser.add_argument("--json", type=Path, help="the figures, for programs")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -181,16 +157,12 @@ def main() -> None:
             frames = list(log)[:: given.every][: given.max_frames or None]
         walks = [[(replace(f, depth_m=None), f.depth_m) for f in frames if f.depth_m is not None]]
     figures: dict[str, Any] = {"stages_ms": stages(walks[0], config)}
-    results: list[Result] = []
     for delay in given.delay:
         settings = msgspec.structs.replace(config, delay_frames=delay)
-        results = [compute(walk, settings) for walk in walks]
-        figures[f"delay {delay}"] = report(results)
+        figures[f"delay {delay}"] = report([compute(walk, settings) for walk in walks])
     print(json.dumps(figures, indent=1))
     if given.json is not None:
         given.json.write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    if given.picture is not None and results:
-        write_picture(given.picture, picture(results[0]))
 
 
 if __name__ == "__main__":

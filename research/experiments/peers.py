@@ -28,7 +28,7 @@ from research.train.train import STATE_FILE, WEIGHTS_FILE
 from research.train.train_state import unfinished_step
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-COMMAND = str(Path(sys.executable).with_name("semantic-mapper"))
+COMMAND = str(Path(sys.executable).with_name("semantic-mapper-research"))
 
 
 @dataclass(frozen=True)
@@ -170,18 +170,8 @@ def compare(names: list[str], out: Path, tier: str = "cpu") -> int:
         return 1
     weights = [out / name / WEIGHTS_FILE for name in names]
     for depth in ("on", "off"):
-        command = [
-            COMMAND,
-            "benchmark",
-            "rooms",
-            "--no-own-image",
-            "--depth",
-            depth,
-            "--tier",
-            tier,
-            "--out",
-            str(out / f"depth-{depth}.json"),
-        ]
+        command = [COMMAND, "suite", "rooms", "--no-own-image", "--depth", depth, "--tier", tier]
+        command += ["--out", str(out / f"depth-{depth}.json")]
         for file in weights:
             command += ["--weights", str(file)]
         code = subprocess.run(command, check=False).returncode

@@ -1,4 +1,4 @@
-"""Maps of rooms before and after ``refine``, without the query views of ``benchmark rooms --map --refine``.
+"""Maps of rooms before and after ``refine``, without the query views of ``suite rooms --map --refine``.
 
 Maps are kept, so that other weights are scored in a fraction of the time. A run that ended early goes on where it was.
 

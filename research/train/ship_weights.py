@@ -91,7 +91,7 @@ def figures_of(weights: Path, table: Path) -> dict[str, Any]:
         found = json.loads(table.read_text(encoding="utf-8"))
         suite, complete, entries = found["suite"], found["complete"], found["weights"].values()
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{table}: not a table of `benchmark rooms` ({error})") from error
+        raise ConfigError(f"{table}: not a table of `suite rooms` ({error})") from error
     if not complete or suite["rooms"]:
         raise ConfigError(f"{table}: does not hold all rooms of its split; run the same command to its end")
     digest = load_entries([weights])[0].digest

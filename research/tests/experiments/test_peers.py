@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from research.cli.main import app
 from research.experiments import peers
 from research.train.train import STATE_FILE
 
@@ -19,6 +20,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         returncode = 0
 
     def run(command: list[str], **_: object) -> Done:
+        assert Path(command[0]).name == app.info.name and command[1] in [verb.name for verb in app.registered_commands]
         seen.append(command)
         if "train" in command:
             (Path(command[command.index("--out") + 1]) / STATE_FILE).write_bytes(b"state")
