@@ -27,6 +27,7 @@ from semantic_mapper.evaluation.metrics import (
     confusion_of,
 )
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
+from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import NesfWeights
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
@@ -131,6 +132,18 @@ def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -
     views += [_step(pipeline, waited) for waited in pipeline.prepare_rest()]
     surface = true_surface(scene, poses)
     return FusedRoom(scene, pipeline.voxel_map, views, surface)
+
+
+def kept_room(seed: int, suite: SuiteConfig, folder: Path, rendered: int = 1) -> tuple[Path, TrueSurface]:
+    """The file of a room's map by the default weights, and its true surface; made where ``folder`` lacks them."""
+    saved, true = folder / f"{seed}-map.npz", folder / f"{seed}-surface.npz"
+    if not true.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        room = fuse_room(seed, default_checkpoint_path(), suite, rendered)
+        room.voxel_map.save(saved)
+        np.savez_compressed(true, xyz=room.surface.xyz, label=room.surface.label, instance=room.surface.instance)
+    with np.load(true) as kept:
+        return saved, TrueSurface(kept["xyz"], kept["label"], kept["instance"])
 
 
 def _depth(suite: SuiteConfig) -> DepthConfig:

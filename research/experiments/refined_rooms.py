@@ -18,13 +18,13 @@ import numpy as np
 from research.evaluation.bootstrap import paired_bootstrap
 from research.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
 from research.evaluation.points import nearest_points
-from research.evaluation.room_map import NEAR_M, UP, TrueSurface, compare_instances, fuse_room, in_rooms
+from research.evaluation.room_map import NEAR_M, UP, compare_instances, in_rooms, kept_room
 from research.suites.config import SuiteConfig, settings_digest, suite_seeds
 from research.suites.records import CalibrationRecord, InstanceRecord, Rows
 from research.suites.scoring import as_calibration, as_rows, from_rows
 from semantic_mapper.config import Config
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_error, confusion_of
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint
+from semantic_mapper.fields.checkpoint import find_checkpoint
 from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.refine import refine
@@ -49,14 +49,7 @@ class KeptRoom:
 
     def __init__(self, seed: int, suite: SuiteConfig, rendered: int, folder: Path) -> None:
         self.seed = seed
-        self._map_file, rest = folder / f"{seed}-map.npz", folder / f"{seed}.npz"
-        if not rest.is_file():
-            room = fuse_room(seed, default_checkpoint_path(), suite, rendered)
-            folder.mkdir(parents=True, exist_ok=True)
-            room.voxel_map.save(self._map_file)
-            np.savez_compressed(rest, sx=room.surface.xyz, sl=room.surface.label, si=room.surface.instance)
-        with np.load(rest) as kept:
-            self._surface = TrueSurface(kept["sx"], kept["sl"], kept["si"])
+        self._map_file, self._surface = kept_room(seed, suite, folder, rendered)
         self._xyz = VoxelMap.load(self._map_file).points().xyz
         self._truth_of = nearest_points(self._xyz, self._surface.xyz, max_distance_m=NEAR_M)
         self._point_of = nearest_points(self._surface.xyz, self._xyz, max_distance_m=NEAR_M)

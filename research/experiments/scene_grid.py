@@ -85,13 +85,7 @@ def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[s
     return rows
 
 
-def _room_row(
-    name: str,
-    field: LearnedField,
-    held_out: Sequence[PosedFrame],
-    seconds: float,
-    out: Path | None,
-) -> str:
+def _room_row(name: str, field: LearnedField, held_out: Sequence[PosedFrame], seconds: float, out: Path | None) -> str:
     renders = [_render(field, f) for f in held_out]
     _picture(out, name.replace(", ", "-").replace(" ", "-"), held_out, renders)
     exact = [resize_depth(f, f.intrinsics) for f in held_out]
@@ -170,9 +164,8 @@ def main() -> None:
             print("\n".join(measure_room(seed, args.out, settings)), flush=True)
         return
     print("| scene | PSNR, dB | CPU s | peak memory | digest |\n|---|---|---|---|---|")
-    measure = measure_objects
     for seed in range(1, args.scenes + 1):
-        print(measure(seed, args.out, settings), flush=True)
+        print(measure_objects(seed, args.out, settings), flush=True)
 
 
 if __name__ == "__main__":

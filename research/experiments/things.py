@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from research.evaluation.room_map import TrueSurface, fuse_room, match_things
+from research.evaluation.room_map import kept_room, match_things
 from research.suites.config import SuiteConfig, suite_seeds
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import EVEN_CONFIDENCE, EVEN_M2, LISTED, Instance
 
@@ -44,15 +43,8 @@ Room = tuple[list[Piece], Counter[str]]  # what was found, the surest first, and
 
 def find_things(seed: int, suite: SuiteConfig, folder: Path) -> Room:
     """The pieces and true things of a room; its map and its true surface are kept in ``folder``."""
-    saved, rest = folder / f"{seed}-map.npz", folder / f"{seed}.npz"
-    if not rest.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        room = fuse_room(seed, default_checkpoint_path(), suite)
-        room.voxel_map.save(saved)
-        np.savez_compressed(rest, xyz=room.surface.xyz, label=room.surface.label, instance=room.surface.instance)
+    saved, surface = kept_room(seed, suite, folder)
     voxel_map = VoxelMap.load(saved)
-    with np.load(rest) as kept:
-        surface = TrueSurface(kept["xyz"], kept["label"], kept["instance"])
     things, matches = match_things(voxel_map, surface)
     names = dict(zip(voxel_map.label_set.ids, voxel_map.label_set.names, strict=True))
     taken, pieces = set[int](), list[Piece]()
