@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ class FloodedMapper:
         """Seconds until a good frame is in the map."""
         frame = self._frames[self._sent % len(self._frames)]
         self._sent += 1
-        parts = encode_frame(type(frame)(**{**_fields(frame), "seq": self._sent, "stamp_ns": time.monotonic_ns()}))
+        parts = encode_frame(replace(frame, seq=self._sent, stamp_ns=time.monotonic_ns()))
         began_s = time.monotonic()
         self.publisher.publish(parts, ANSWER_S)
         while time.monotonic() - began_s < ANSWER_S:
@@ -107,10 +108,6 @@ class FloodedMapper:
         self.child.wait(ANSWER_S)
         self.child.close()
         self.publisher.close()
-
-
-def _fields(frame: object) -> dict[str, object]:
-    return {name: getattr(frame, name) for name in type(frame).__slots__}  # pyright: ignore
 
 
 def floods(weights: str, config: str, rounds: int, messages: int) -> Iterator[Outcome]:
