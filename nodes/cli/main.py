@@ -152,8 +152,8 @@ def _options(
 ) -> None:
     """Posed camera frames in, live semantic 3D map out. Begin with `demo`.
 
-    Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage or settings, 3 a map that cannot be trusted
-    (`map`), 130 Ctrl-C.
+    Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage or settings, 3 a map that cannot be trusted,
+    4 an empty map, 130 Ctrl-C.
     """
     Settings.verbose = verbose
 

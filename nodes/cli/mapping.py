@@ -58,14 +58,14 @@ def map_(
 ) -> int:
     """Map a recording: a log, a film, or what `import` takes.
 
-    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, as by
-    `import` and with its options. Bad frames are refused with the reason; the rest is mapped.
-    Ctrl-C writes the map so far (exit code 130). Exit code 3: poses and depth contradict each other, or computed depth
-    is mostly at the end of its range. Exit code 4: the map is empty, or nearly so.
+    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, with
+    the options of `import`. Bad frames are refused with the reason; the rest is mapped.
+    Ctrl-C writes the map so far. Exit code 3: poses and depth contradict each other, or computed depth ends at its
+    range; 4: the map is empty, or nearly so.
 
     Example: semantic-mapper map path/to/redkitchen --open
-    Example: semantic-mapper map kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
-    Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
+    Example: semantic-mapper map kitchen.mcap --weights kitchen.safetensors
+    Example: semantic-mapper map film.mp4 --camera-height 1.5
     """
     must_be_there(*source)
     refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))

@@ -75,13 +75,12 @@ def query(
     """Ask a saved map, or a running mapper, what is where.
 
     info: size and classes. at X Y Z: class at a point, and whether it is free, occupied or unknown. nearest CLASS X Y
-    Z: the nearest thing or surface of a class. instances: countable things with upright boxes, how certain each is
-    (certainty) and how much of its outside was seen. graph: floors, rooms, doors, and things by room. correct FILE:
-    move the map of a running mapper that keeps frames (`history.max_frames`) to corrected poses (TUM; within 5 ms of
-    a frame). relocalize LOG: find frames with measured depth in a saved map; exit code 1 where they do not agree.
+    Z: the nearest thing or surface of a class. instances: countable things with upright boxes, certainty and the
+    fraction seen. graph: floors, rooms, doors, and things by room. correct FILE:
+    move the map of a running mapper that keeps frames to corrected poses (TUM). relocalize LOG: find frames with measured depth in a saved map; exit code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
-    Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
+    Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
     Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """

@@ -66,7 +66,7 @@ WeightsOption = Annotated[
     Path | None,
     typer.Option(
         "--weights",
-        help="Weights file, or `rooms-computed-depth`: for cameras without depth",
+        help="File, or `rooms-computed-depth` (cameras without depth)",
     ),
 ]
 MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]

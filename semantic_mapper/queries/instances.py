@@ -6,7 +6,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import cv2
@@ -68,7 +68,8 @@ class Instance:
     confidence: float  # mean over its voxels
     centroid: Float64  # (3,) float64 mean of its surface points, world metres
     box: OrientedBox  # upright box round its surface points
-    voxels: NDArray[np.int32]  # (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``
+    # (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``
+    voxels: NDArray[np.int32] = field(repr=False)
     measured: float = 1.0  # fraction of them that a sensor measured; the depth of the others was computed
     certainty: float = 1.0  # probability that it is a thing of its class, IoU 0.25 or more; see ``certainty_of``
     # fraction of its outside that was seen: of its silhouettes from the four sides of its box and from above, the area
