@@ -62,6 +62,8 @@ def test_a_border_between_classes_is_found_to_the_pixel_with_a_fifth_of_the_rays
     np.testing.assert_allclose(depth, expected_depth, atol=1e-6)
     assert known.all()
     assert rays == field.rays < 0.2 * 30 * 40
+    p, known, _, _ = sparse(Halves(border, unknown_above=10), fraction=0.0)
+    np.testing.assert_allclose(p[known].sum(1), 1, atol=1e-6)
 
 
 def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_own():
