@@ -57,7 +57,7 @@ def export(
     Maps: .ply points, .obj and .glb meshes, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for nav2: a cell is
     free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown 255).
 
-    Logs: .mcap for Foxglove, .rrd, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
+    Logs: .mcap for Foxglove, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
     --format tum a TUM RGB-D sequence.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class

@@ -30,7 +30,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Live": {
         "calibrate": ("calibrate:calibrate", "Calibrate cameras from images of a printed ChArUco board."),
         "up": ("up:up", "Start the nodes of a launch file, and watch over them."),
-        "view": ("view:view", "Show a running launch, a log or a saved map in a browser."),
+        "view": ("view:view", "Show a running launch or a saved map in a browser."),
         "record": ("record:record", "Record what the nodes of a running launch publish."),
     },
     "Use a map": {

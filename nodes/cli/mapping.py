@@ -50,7 +50,7 @@ def map_(
     out: Path | None = None,  # folder for the results [runs/NAME]
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
-    rerun: Path | None = None,  # also write a Rerun recording (.rrd)
+    rerun: Path | None = None,  # also a Rerun recording (.rrd)
     corrections: Path | None = None,  # corrected poses (TUM)
     accept_untrusted: bool = False,  # exit code 0 in place of 3
     open_: bool = False,  # show the report in a browser at the end
@@ -58,10 +58,9 @@ def map_(
 ) -> int:
     """Map a recording: a log, a film, or what `import` takes.
 
-    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first, with
-    the options of `import`. Bad frames are refused with the reason; the rest is mapped.
-    Ctrl-C writes the map so far. Exit code 3: poses and depth contradict each other, or computed depth ends at its
-    range; 4: the map is empty, or nearly so.
+    Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first (options: see
+    `import`). Bad frames are refused with the reason. Ctrl-C writes the map so far. Exit code 3: poses and depth
+    contradict each other, or computed depth ends at its range; 4: the map is empty, or nearly so.
 
     Example: semantic-mapper map path/to/redkitchen --open
     Example: semantic-mapper map kitchen.mcap --weights kitchen.safetensors

@@ -30,7 +30,7 @@ def scale(
     height: AtLeastZero = 0.0,  # in their place: of the camera over the floor, metres, the median of its way
     weights: WeightsOption = None,
 ) -> int:
-    """Give a film's map metres by one length that is known, and map its log again.
+    """Give the map of a film metres, and map it again.
 
     Poses are not found again, but scaled; voxels and classes depend on metres, so that the log is mapped with the
     settings of before. Log and results in RUN are replaced once the new ones are whole. A map with measured depth is

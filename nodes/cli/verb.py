@@ -66,7 +66,7 @@ WeightsOption = Annotated[
     Path | None,
     typer.Option(
         "--weights",
-        help="File, or `rooms-computed-depth` (cameras without depth)",
+        help="File, or `rooms-computed-depth` (no depth sensor)",
     ),
 ]
 MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]

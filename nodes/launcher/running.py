@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.box import SIMPLE
 from rich.table import Table
-from rich.text import Text
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import write_bytes
+from semantic_mapper.nodes.console import table
 from semantic_mapper.nodes.launcher.launch_file import Launch
 from semantic_mapper.plain_text import plain_without_secrets, visible
 from semantic_mapper.replay.summary import dig
@@ -110,18 +109,17 @@ class LaunchView:
 
     def table(self) -> Table:
         """For people."""
-        table = Table(title=f"launch, heard {self.silent_s:.1f} s ago", title_justify="left", box=SIMPLE)
-        table.collapse_padding, table.pad_edge = True, False
-        for heading in ("node", *_COLUMNS):
-            table.add_column(heading, justify="left" if heading in ("node", "state") else "right", no_wrap=True)
         shown = self.to_json()
         rows = {**shown["nodes"], **({STATUS_SOCKET: shown["launch"]} if shown["launch"] else {})}
-        for name, row in rows.items():
-            table.add_row(name, *(_cell(row, *column) for column in _COLUMNS.values()))
+        cells = [(name, *(_cell(row, *column) for column in _COLUMNS.values())) for name, row in rows.items()]
         warnings = [f"{name}: {t}" for name, row in rows.items() for t in row["degraded"] if name != STATUS_SOCKET]
-        if warnings:
-            table.caption, table.caption_justify = Text("\n".join(map(visible, warnings))), "left"
-        return table
+        return table(
+            cells,
+            ("node", *_COLUMNS),
+            title=f"launch, last report {self.silent_s:.1f} s ago",
+            caption="\n".join(map(visible, warnings)),
+            numbers=[name for name in _COLUMNS if name != "state"],
+        )
 
 
 def _describe(history: list[Status]) -> dict[str, Any]:

@@ -20,11 +20,10 @@ from semantic_mapper.transport.images import sniff_image
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
-LogFormat = Literal["foxglove", "rrd", "trajectory", "tum", "folder"]
+LogFormat = Literal["foxglove", "trajectory", "tum", "folder"]
 FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
 _SUFFIXES: dict[str, LogFormat] = {
     ".mcap": "foxglove",
-    ".rrd": "rrd",
     ".txt": "trajectory",
     ".tum": "trajectory",
     "": "folder",
@@ -103,10 +102,6 @@ def export_log(
 def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
     if name == "foxglove":
         return FoxgloveExporter(place, info)
-    if name == "rrd":
-        from semantic_mapper.replay.exporters.rerun import RerunExporter
-
-        return RerunExporter(place, info)
     if name == "trajectory":
         return TrajectoryExporter(place, info.scale_known)
     return TumExporter(place) if name == "tum" else FolderExporter(place, info)

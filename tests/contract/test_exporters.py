@@ -126,8 +126,8 @@ def _rerun_rows(path: Path) -> dict[str, int]:
 
 
 def look_at_rrd(folder: Path) -> dict[str, Any]:
-    """Entities of a map's and of a log's recording, and how often each was logged."""
-    return {"map": _rerun_rows(export(MAP, folder / "map.rrd")), "log": _rerun_rows(export(LOG, folder / "log.rrd"))}
+    """Entities of a map's recording, and how often each was logged."""
+    return {"map": _rerun_rows(export(MAP, folder / "map.rrd"))}
 
 
 def look_at_trajectory(folder: Path) -> dict[str, Any]:

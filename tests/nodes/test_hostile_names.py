@@ -187,7 +187,6 @@ FORMS = (
         "import {} a.mcap",
         "info {}",
         "view {}",
-        "export {} --out a.rrd",
         "eval {}",
         "up {}",
         "up replay --set camera.log={} --set camera.mode={}",

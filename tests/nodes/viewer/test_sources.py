@@ -86,7 +86,7 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
         (tmp_path / name).write_bytes(b"neither of these" * 100)
     for source, reason in (
         (tmp_path / "map.npz", "damaged or not a map"),
-        (tmp_path / "log.mcap", "not an MCAP log"),
+        (tmp_path / "log.mcap", "--view` shows it"),
         (tmp_path / "text", "no socket folder of a launch"),
         ("tcp://10.1.2.3:5570", "without keys"),
     ):
