@@ -55,7 +55,7 @@ def choose_format(path: Path, given: str | None, suffixes: dict[str, Name], form
     for name in formats:
         if name == wanted:
             return name
-    hint = nearest(path.suffix.lower(), list(suffixes))
+    hint = nearest(path.suffix.lower(), [suffix for suffix in suffixes if suffix])
     raise ConfigError(f"{path}: its ending names no format of --format {'|'.join(formats)}{hint}")
 
 

@@ -202,7 +202,7 @@ class InstanceTracker:
             + np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1).astype(np.int32),
             float(snapshot.measured(slot, voxel).mean()),
             certainty_of(name, confidence, len(part) * snapshot.voxel_size_m**2),
-            _fraction_seen(snapshot, voxels.point[part], box),
+            float(_fraction_seen(snapshot, voxels.point[part], box)),
         )
 
     def _match(self, last: _Found, voxels: ThingVoxels, found: Components, ids: Int64) -> None:

@@ -41,5 +41,5 @@ def test_a_wheel_holds_launch_files_that_its_command_finds_by_name_and_no_resear
     )
     command = [sys.executable, "-P", "-c", program, "up", "replay"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and f"{packaged}/replay.toml" in error_line(done.stderr)
+    assert done.returncode == 2 and f"{packaged}/replay.toml" in error_line(done.stderr)
     assert "--set camera.log=" in done.stderr

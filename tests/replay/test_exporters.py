@@ -183,10 +183,10 @@ def test_what_cannot_be_written_is_refused_and_what_is_damaged_left_out(log: Pat
     before = log.read_bytes()
     for out, name, error, message in (
         (tmp_path / "there", "folder", LogError, "exists already"),
-        (tmp_path / "there", "rrd", LogError, "exists already"),
+        (tmp_path / "there", "trajectory", LogError, "exists already"),
         (log, "foxglove", LogError, "exists already"),
-        (tmp_path / "a.xyz", None, ConfigError, "which format"),
-        (tmp_path / "a.mcap", "glb", ConfigError, "which format"),
+        (tmp_path / "a.xyz", None, ConfigError, "names no format"),
+        (tmp_path / "a.mcap", "glb", ConfigError, "names no format"),
         (tmp_path / "no" / "such", "tum", LogError, "cannot be written"),
     ):
         with pytest.raises(error, match=message):
