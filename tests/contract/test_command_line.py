@@ -64,7 +64,7 @@ COMMANDS: dict[str, str] = {
     "keys show": "keys show --keys {tmp}/keys --json",
     "keys forget": "keys forget robot --keys {tmp}/keys",
     "keys forget nobody": "keys forget robot --keys {tmp}/keys",
-    "keys show where there are none": "keys show --keys {tmp}/none",
+    "keys show without any": "keys show --keys {tmp}/none",
     "finetune without a file": "finetune {log} --keyframes 2",
     "map nothing": "map {tmp}/none.mcap --out {tmp}/run",
     "map with missing weights": "map {log} --out {tmp}/run --weights {tmp}/none.safetensors",

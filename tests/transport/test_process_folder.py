@@ -13,7 +13,7 @@ from semantic_mapper.transport.process_folder import OwnFolder, is_in_use, sweep
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A TMPDIR that is shared with another container, whose process numbers are none of here."""
+    """A TMPDIR that is shared with another container, whose process numbers mean nothing here."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(os, "getpid", lambda: 99_999_999)
     return tmp_path

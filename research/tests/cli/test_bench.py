@@ -23,4 +23,4 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
     assert found["step_p50_ms"] > 0
     assert plot.read_bytes().startswith(b"\x89PNG")
     done = run("bench", "map", *SMALL, "--loops", "5", "--weights", weights, "--config", config)
-    assert done.returncode == 1 and "returns" in error_line(done.stderr), "a walk that is none"
+    assert done.returncode == 1 and "returns" in error_line(done.stderr), "a walk that does not return"
