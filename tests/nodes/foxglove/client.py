@@ -30,6 +30,7 @@ class FoxgloveClient(ExitStack):
         super().__init__()
         self._topics = topics
         self._topic_of: list[str] = []  # by subscription
+        self._channels: list[int] = []  # likewise, the server's numbers
         opened = connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, compression=None)
         self._socket = self.enter_context(opened)
 
@@ -45,12 +46,20 @@ class FoxgloveClient(ExitStack):
                 said = json.loads(message)
                 if said["op"] == "advertise":
                     self._subscribe(said["channels"])
+                elif said["op"] == "status" and "Unknown channel" in said["message"]:
+                    # the SDK advertises a channel an instant before a client may subscribe to it
+                    self._ask(int(said["message"].rsplit(maxsplit=1)[1]))
             elif message[0] == MESSAGE_DATA:
                 subscription, log_time_ns = struct.unpack_from("<IQ", message, 1)
                 return Received(self._topic_of[subscription], log_time_ns, message[13:])
 
     def _subscribe(self, channels: list[dict[str, str]]) -> None:
         wanted = [c for c in channels if self._topics is None or c["topic"] in self._topics]
-        new = [{"id": n, "channelId": c["id"]} for n, c in enumerate(wanted, len(self._topic_of))]
+        first = len(self._channels)
         self._topic_of += [channel["topic"] for channel in wanted]
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": new}))
+        self._channels += [int(channel["id"]) for channel in wanted]
+        self._ask(*self._channels[first:])
+
+    def _ask(self, *channels: int) -> None:
+        wanted = [{"id": self._channels.index(channel), "channelId": channel} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
