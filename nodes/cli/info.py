@@ -20,13 +20,11 @@ from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.plain_text import counted
-from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.box_picture import draw_boxes
-from semantic_mapper.replay.boxes import BoxFile, load_boxes, with_times
+from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.replay.run_folder import is_map, map_path, prepare_file, refuse_overwriting
+from semantic_mapper.replay.run_folder import is_map, map_path
 from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
@@ -40,9 +38,6 @@ def info(
     # of `query MAP instances`, or XML of KITTI-360; `live`, ipc://PATH or tcp://HOST:PORT of a mapper
     file: list[str],
     remote: Remote,
-    *,
-    picture: Path | None = None,  # draw boxes over the three frames of this log that show most of them
-    out: Path | None = None,  # --picture: what to write (.png, .jpg)
 ) -> int:
     """Say what a log, a map, weights or a file of boxes holds.
 
@@ -54,15 +49,11 @@ def info(
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo
-    Example: semantic-mapper info boxes.json --picture kitchen.mcap --out boxes.png
     Example: semantic-mapper info live
     """
     path = Path(file[0])
-    boxes = path.suffix.lower() in BOX_FILES
-    if (picture is None) is not (out is None) or (picture is not None and not boxes):
-        raise typer.BadParameter("go together, with a file of boxes", param_hint="--picture and --out")
-    if boxes:
-        found = _boxes_info(output, path, picture, out)
+    if path.suffix.lower() in BOX_FILES:
+        found = _boxes_info(output, path)
     elif path.suffix == ".safetensors":
         found = _weights_file_info(output, path)
     elif is_running_mapper(file[0]):
@@ -278,32 +269,20 @@ def _weights_file_info(output: Output, path: Path) -> dict[str, Any]:
     return found
 
 
-def _boxes_info(output: Output, file: Path, picture: Path | None, out: Path | None) -> dict[str, Any]:
-    """List the boxes of a file, or draw them."""
-    boxes = load_boxes(file)
-    found = _describe_boxes(boxes)
-    if picture is None or out is None:
-        rows = [
-            (
-                *(box["id"], box["class"], box["shape"], "yes" if box["thing"] else "no"),
-                *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
-                len(box["stamps_ns"]) or len(box["frames"]) or "always",
-            )
-            for box in found["boxes"]
-        ]
-        caption = f"left out: {found['left_out']} of no class" if found["left_out"] else ""
-        names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
-        output.print(table(rows, names, title=str(file), caption=caption))
-        return found
-    refuse_overwriting(out, file, picture)
-    prepare_file(out)
-    with open_log(picture) as log:
-        timed, _ = with_times(boxes, file, log)
-        drawn, seen = draw_boxes(log, timed.primitives, f"{file.name} in {picture.name}")
-    write_picture(out, drawn)
-    count = counted(len(boxes.primitives), "box", "boxes")
-    hint = "" if seen or not boxes.primitives else "; are they in the log's world frame?"
-    output.print(f"{seen} of {count} in view of its frames{hint}; written to {out}")
+def _boxes_info(output: Output, file: Path) -> dict[str, Any]:
+    """List the boxes of a file."""
+    found = _describe_boxes(load_boxes(file))
+    rows = [
+        (
+            *(box["id"], box["class"], box["shape"], "yes" if box["thing"] else "no"),
+            *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
+            len(box["stamps_ns"]) or len(box["frames"]) or "always",
+        )
+        for box in found["boxes"]
+    ]
+    caption = f"left out: {found['left_out']} of no class" if found["left_out"] else ""
+    names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
+    output.print(table(rows, names, title=str(file), caption=caption))
     return found
 
 

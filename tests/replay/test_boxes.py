@@ -177,10 +177,10 @@ def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path
         entry(id=2, shape="mesh", size=None, vertices=(CORNERS + 10).tolist(), faces=triangles),
     ]
     prism, mesh = load_boxes(write(tmp_path / "a.json", *entries)).primitives
-    corners = np.array([(x, y, z) for x in (10, 19) for y in (0, 4) for z in (-0.15, 0.15)])
-    np.testing.assert_allclose(prism.corners(), corners @ T[:3, :3].T + T[:3, 3])
     np.testing.assert_allclose(prism.T_world_box, prism.stamps[0][1] if prism.stamps else None)
-    np.testing.assert_allclose(mesh.corners(), (CORNERS + 10) @ T[:3, :3].T + T[:3, 3])
+    for box, low, high in ((prism, (10, 0, -0.15), (19, 4, 0.15)), (mesh, (10 - 0.5,) * 3, (10 + 0.5,) * 3)):
+        drawn = (box.mesh()[0] - T[:3, 3]) @ T[:3, :3]
+        np.testing.assert_allclose((drawn.min(0), drawn.max(0)), (low, high), atol=1e-12)
     for box, size in ((prism, (4.5, 2, 0.15)), (mesh, (0.5, 0.5, 0.5))):
         core = (resized(box, 0.5 * box.size).mesh()[0] - box.T_world_box[:3, 3]) @ box.T_world_box[:3, :3]
         np.testing.assert_allclose((core.min(0), core.max(0)), np.outer((-0.5, 0.5), size), atol=1e-12)
@@ -191,7 +191,7 @@ def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
     (tmp_path / "boxes.json").write_text(text.split("```json")[1].split("```")[0])
     car, road = load_boxes(tmp_path / "boxes.json").primitives
     assert (car.thing, road.thing) == (True, False)
-    np.testing.assert_array_equal(road.corners().min(0)[:2], (0, 0))
+    np.testing.assert_allclose(road.mesh()[0].min(0)[:2], (0, 0), atol=1e-12)
     assert PrimitiveSet([road]).inside(road.T_world_box[:3, 3] + np.array([(0.1, -0.1, 0)])).all()
 
 

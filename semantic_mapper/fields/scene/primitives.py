@@ -72,11 +72,6 @@ class Primitive:
         vertices, faces = closed_mesh(vertices, faces)
         return vertices @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3], faces
 
-    def corners(self) -> Float64:
-        """The 8 corners (8, 3) of its box, world metres; the last axis changes fastest."""
-        signs = np.stack(np.meshgrid(*(3 * [(-0.5, 0.5)]), indexing="ij"), -1).reshape(8, 3)
-        return (signs * self.size) @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
-
 
 def moved(box: Primitive, move: Callable[[Float64], Float64]) -> Primitive:
     """A primitive with all its poses (4, 4) changed alike."""
