@@ -54,8 +54,9 @@ def export(
 ) -> None:
     """Write a saved map, or a log, in a format of other programs.
 
-    Maps: .ply points, .obj and .glb meshes, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for nav2: a cell is
-    free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown 255).
+    Maps: .ply points (--format ply-mesh: a mesh), .glb mesh, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for
+    nav2: a cell is free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown
+    255).
 
     Logs: .mcap for Foxglove, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
     --format tum a TUM RGB-D sequence.

@@ -21,7 +21,6 @@ from semantic_mapper.mapping.formats import (
     sure_points,
     write_glb,
     write_npz,
-    write_obj,
     write_ply,
 )
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
@@ -31,10 +30,9 @@ from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.replay.exporters.base import choose_format
 from semantic_mapper.types import Float64
 
-Format = Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"]
+Format = Literal["ply", "ply-mesh", "glb", "npz", "grid", "rrd"]
 SUFFIXES: dict[str, Format] = {
     ".ply": "ply",
-    ".obj": "obj",
     ".glb": "glb",
     ".npz": "npz",
     ".pgm": "grid",
@@ -44,7 +42,7 @@ SUFFIXES: dict[str, Format] = {
 FORMATS: tuple[Format, ...] = get_args(Format)
 # Formats that an option is for, besides min_weight and min_confidence.
 _OPTIONS: dict[str, tuple[Format, ...]] = {
-    "color": ("ply", "ply-mesh", "obj", "glb"),
+    "color": ("ply", "ply-mesh", "glb"),
     "up": ("glb", "grid"),
     **dict.fromkeys(("height", "resolution", "floor", "costs"), ("grid",)),
 }
@@ -115,7 +113,7 @@ def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Expor
     if request.format == "grid":
         require_metres(voxel_map.scale_known, f"{path}: a floor plan")
         return _export_grid(voxel_map, path, request)
-    write = _export_mesh if request.format in ("ply-mesh", "obj", "glb") else _export_points
+    write = _export_mesh if request.format in ("ply-mesh", "glb") else _export_points
     report = write(voxel_map, path, request)
     if voxel_map.scale_known:
         return report
@@ -148,8 +146,6 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     mesh, found = colored(mesh, labels, color), ()
     if request.format == "ply-mesh":
         write_ply(path, mesh, labels, scale_known=scale_known)
-    elif request.format == "obj":
-        write_obj(path, mesh, scale_known=scale_known)
     else:
         up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), labels)
         write_glb(path, mesh, up, scale_known=scale_known)

@@ -1,4 +1,4 @@
-"""A map as files of other programs: PLY, OBJ and GLB (surface), NPZ (points).
+"""A map as files of other programs: PLY and GLB (surface), NPZ (points).
 
 Files hold the world frame, in metres unless they say "scale: unknown"; one that cannot be written is a ``MapError``. Of
 PLY, ``comment label 3 chair`` says what the id 3 of ``label`` means; names are ASCII with Python's escapes. Where depth
@@ -95,17 +95,6 @@ def _escaped(name: str) -> str:
     while len(escaped := name.encode("unicode_escape").decode("ascii")) > MAX_NAME:
         name = name[:-1]  # a whole letter, however long its escape is
     return escaped
-
-
-def write_obj(path: Path, mesh: MapMesh, *, scale_known: bool = True) -> None:
-    """Write vertices to the micrometre, each with its colour behind it (``v x y z r g b``), and faces.
-
-    OBJ knows neither units nor an up axis: vertices are in the world frame, metres."""
-    rows = np.concatenate((mesh.vertices.astype(np.float64), mesh.rgb / 255), axis=1).tolist()
-    with atomic_write(path, raises=MapError) as file:
-        file.write(b"" if scale_known else b"# scale: unknown\n")
-        file.writelines(b"v %.6f %.6f %.6f %.4f %.4f %.4f\n" % tuple(row) for row in rows)
-        file.writelines(b"f %d %d %d\n" % tuple(face) for face in (mesh.faces.astype(np.int64) + 1).tolist())
 
 
 _UINT16, _UINT32, _FLOAT = 5123, 5125, 5126

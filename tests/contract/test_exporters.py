@@ -64,14 +64,6 @@ def look_at_ply_mesh(folder: Path) -> dict[str, Any]:
     return {"header": header, "faces": faces, "points": describe(points)}
 
 
-def look_at_obj(folder: Path) -> dict[str, Any]:
-    """Vertices with colours, and faces."""
-    lines = export(MAP, folder / "map.obj", "--color", "class").read_text().splitlines()
-    vertices = np.array([line.split()[1:] for line in lines if line.startswith("v ")], np.float64)
-    faces = sum(line.startswith("f ") for line in lines)
-    return {"vertices": statistics(vertices), "count": len(vertices), "faces": faces}
-
-
 def look_at_glb(folder: Path) -> dict[str, Any]:
     """The JSON of the file, and the bounds that it tells."""
     data = export(MAP, folder / "map.glb", "--up", "z").read_bytes()
@@ -182,7 +174,6 @@ def look_at_foxglove(folder: Path) -> dict[str, Any]:
 _LOOKS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "ply": look_at_ply,
     "ply-mesh": look_at_ply_mesh,
-    "obj": look_at_obj,
     "glb": look_at_glb,
     "npz": look_at_npz,
     "grid": look_at_grid,

@@ -14,7 +14,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.floor_plan import find_up
-from semantic_mapper.mapping.formats import colored, sure_faces, sure_points, write_glb, write_npz, write_obj, write_ply
+from semantic_mapper.mapping.formats import colored, sure_faces, sure_points, write_glb, write_npz, write_ply
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64
@@ -85,16 +85,13 @@ def test_glb_holds_places_and_colours_and_open3d_reads_it_with_y_up(tmp_path: Pa
     np.testing.assert_allclose(corners, np.stack((x, z, -y), axis=1), atol=1e-6)  # no mirror
 
 
-def test_open3d_reads_obj_and_ply_mesh_alike(tmp_path: Path) -> None:
-    write_obj(tmp_path / "map.obj", MESH)
+def test_open3d_reads_ply_meshes(tmp_path: Path) -> None:
     write_ply(tmp_path / "map.ply", MESH, LABELS)
     o3d = load_open3d()
-    for name in ("map.obj", "map.ply"):
-        mesh = o3d.io.read_triangle_mesh(str(tmp_path / name))
-        corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
-        order, expected = (np.lexsort(c.reshape(-1, 9).T) for c in (corners, MESH.vertices[MESH.faces]))
-        np.testing.assert_allclose(corners[order], MESH.vertices[MESH.faces][expected], atol=1e-6)
-        assert sorted(np.rint(np.asarray(mesh.vertex_colors) * 255).tolist()) == sorted(MESH.rgb.tolist())
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "map.ply"))
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+    order, expected = (np.lexsort(c.reshape(-1, 9).T) for c in (corners, MESH.vertices[MESH.faces]))
+    np.testing.assert_allclose(corners[order], MESH.vertices[MESH.faces][expected], atol=1e-6)
     vertices = o3d.t.io.read_point_cloud(str(tmp_path / "map.ply")).point  # the mesh reader drops what it knows not
     assert (vertices["label"].numpy().ravel() == MESH.label).all()
     assert (vertices["colors"].numpy() == MESH.rgb).all()

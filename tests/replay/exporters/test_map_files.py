@@ -61,9 +61,9 @@ def test_options_that_a_format_cannot_honour_are_refused(corner: VoxelMap, tmp_p
     for request, message in (
         (
             ExportRequest("npz", color="class"),
-            "--color means nothing for format npz; it is for ply, ply-mesh, obj, glb",
+            "--color means nothing for format npz; it is for ply, ply-mesh, glb",
         ),
-        (ExportRequest("obj", up=AXES["z"]), "--up means nothing for format obj"),
+        (ExportRequest("ply-mesh", up=AXES["z"]), "--up means nothing for format ply-mesh"),
         (ExportRequest("glb", height=(0.1, 1)), "--height"),
         (ExportRequest("grid", resolution=0.01), "smaller than the map's voxels"),
     ):
@@ -140,7 +140,6 @@ def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: Voxe
     unknown.note_scale(False)
     for name, where in (
         ("a.ply", "comment scale: unknown"),
-        ("a.obj", "# scale: unknown"),
         ("a.glb", '"scale":"unknown"'),
     ):
         report = export_map(unknown, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
