@@ -36,7 +36,6 @@ LegendRow = tuple[str, Color, float | None]  # class, colour, fraction of the ma
 BACKGROUND, PANEL, GRID = (22, 25, 31), (31, 35, 43), (62, 68, 79)
 TEXT, DIM_TEXT = (234, 237, 242), (172, 180, 192)
 UNKNOWN = (112, 116, 122)
-GOOD, WARN, BAD = (86, 180, 233), (240, 228, 66), (230, 110, 40)  # distinguished without red and green
 CYCLE = ("#56b4e9", "#e69f00", "#2fbf94", "#e28fc0", "#f0e442", "#e8743b", "#c9cdd3")  # after Okabe and Ito, lighter
 TITLE_PT, TEXT_PT, SMALL_PT = 14, 11, 9.5
 _DPI = 100

@@ -13,14 +13,13 @@ from rich.table import Table
 
 from semantic_mapper import __version__
 from semantic_mapper.config import Config
-from semantic_mapper.drivers.calibrating.camera import COEFFICIENT_NAMES, CameraCalibration, draw_calibration
+from semantic_mapper.drivers.calibrating.camera import COEFFICIENT_NAMES
 from semantic_mapper.drivers.calibrating.rig import Calibration
 from semantic_mapper.drivers.calibrating.views import CELLS, CalibrationConfig, ViewGatherer, missing_regions
 from semantic_mapper.drivers.calibration import StereoCalibration, save_calibration, save_stereo
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.nodes.calibration.sources import SIDES
-from semantic_mapper.plots import write_picture
 
 _WORST = 3  # views named in the tables
 
@@ -33,7 +32,7 @@ class CalibrationSettings(Config, frozen=True):
 
 
 def write_files(out: Path, found: Calibration, settings: CalibrationSettings) -> list[Path]:
-    """A TOML file and a picture of each camera; returns their paths. ``ConfigError``: a file cannot be written."""
+    """A TOML file of each camera; returns their paths. ``ConfigError``: a file cannot be written."""
     written: list[Path] = []
     for name, camera in found.cameras.items():
         about = _about(settings) | {"views": len(camera.views), "rms_px": round(camera.rms_px, 4)}
@@ -45,12 +44,12 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
             about["rig_turn_sigma_deg"] = _rounded(place.turn_sigma_deg)
         file = out / f"{name}.toml"
         save_calibration(file, camera.intrinsics, None if place is None else place.T_rig_camera, about)
-        written += [file, _draw(out, name, name, camera)]
+        written.append(file)
     return written
 
 
-def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> list[Path]:
-    """One TOML file of both cameras of a pair, and a picture of each; returns their paths.
+def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> Path:
+    """One TOML file of both cameras of a pair; returns its path.
 
     Cameras are named by the half of the image; their rig tells whose half is which. ``ConfigError``: a file cannot be
     written; it is as it was.
@@ -70,8 +69,7 @@ def write_stereo(out: Path, name: str, found: Calibration, settings: Calibration
     }
     file = out / f"{name}.toml"
     save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
-    sides = zip(SIDES, (left, right), strict=True)
-    return [file, *(_draw(out, f"{name}-{side}", f"{name} {side}", camera) for side, camera in sides)]
+    return file
 
 
 def _rounded(value: float) -> float:
@@ -85,11 +83,6 @@ def _about(settings: CalibrationSettings) -> dict[str, str | float]:
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "board": f"{b.pattern} {b.columns}x{b.rows}, {1000 * b.square_m:g} mm",
     }
-
-
-def _draw(out: Path, file: str, name: str, camera: CameraCalibration) -> Path:
-    write_picture(out / f"{file}.png", draw_calibration(name, camera))
-    return out / f"{file}.png"
 
 
 def as_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def calibrate(
     # Camera (v4l2:DEVICE, oak:ID, realsense:ID, opencv:URL), video, log (.mcap), folder of pictures; of a rig several
     sources: Annotated[list[str] | None, typer.Argument(metavar="[NAME=]PLACE...")] = None,
     *,
-    out: Path = Path("calibration"),  # folder for NAME.toml and NAME.png
+    out: Path = Path("calibration"),  # folder for NAME.toml
     board: Path | None = None,  # write the board, to be printed, to this PNG file
     config: Path | None = None,  # TOML file with [board] (as a pose source of kind board) and [calibration]
     square_mm: float = 0.0,  # side of a square, as measured on the printed board
@@ -69,7 +69,7 @@ def calibrate(
             raise ConfigError(f"{names}: calibrated by its maker already; name several cameras to find where they sit")
         found = solve(gathered.cameras, keep, settings.calibration, rig=rig)
         if stereo:
-            files = report.write_stereo(out, places[0].name, found, settings)
+            files = [report.write_stereo(out, places[0].name, found, settings)]
         else:
             files = report.write_files(out, found, settings)
     plain = report.as_json(found, gathered.cameras, files)

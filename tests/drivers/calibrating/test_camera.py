@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from semantic_mapper.drivers.calibrating import camera
-from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, draw_calibration, ideal_pixels
+from semantic_mapper.drivers.calibrating.camera import calibrate_camera, compare_camera, ideal_pixels
 from semantic_mapper.drivers.calibrating.views import BoardView, CalibrationConfig, ViewGatherer
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics, Float64
-from tests.figures import figure_of, misplaced_texts
 
 from .boards import BOARD, LENS, image, made_up, shown, views
 
@@ -55,11 +54,7 @@ def test_a_known_camera_is_found_from_pictures(gathered: ViewGatherer) -> None:
     turned = off_px.mean()  # a shift of the centre is a small turn of the camera
     assert off_px.max() < 1.5 and turned < 0.8
     assert list(found.sigmas) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
-    assert len(found.errors_px) == len(found.views) == len(found.residuals) == len(found.tilts)
-    picture = draw_calibration("cam", found)
-    assert picture.dtype == np.uint8 and picture.shape[2] == 3
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # corners, lines and bars, not an empty panel
-    assert not misplaced_texts(figure_of(draw_calibration, "cam", found))
+    assert len(found.errors_px) == len(found.views) == len(found.tilts)
 
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8])

@@ -54,9 +54,8 @@ def test_a_folder_becomes_a_file_that_drivers_read_and_a_picture(pictures: Path,
     read = load_calibration(out / "camera.toml")
     assert abs(read.fx / LENS.fx - 1) < 0.005 and (read.width, read.height) == (640, 480)
     assert told["cameras"]["camera"]["fx"] == read.fx and told["cameras"]["camera"]["k1"] == read.distortion[0]
-    assert told["files"] == [str(out / "camera.toml"), str(out / "camera.png")] and told["rig"] is None
+    assert told["files"] == [str(out / "camera.toml")] and told["rig"] is None
     assert load_mount(out / "camera.toml") is None
-    assert cv2.imread(str(out / "camera.png")) is not None
     drawn = cv2.imread(str(sheet), cv2.IMREAD_GRAYSCALE)
     assert drawn is not None and drawn.shape[1] > drawn.shape[0] > 2000
 
@@ -65,7 +64,7 @@ def test_a_rig_is_written_into_the_files_of_its_cameras(pictures: Path, tmp_path
     gathered = gather(f"left={pictures}", f"right={pictures}")  # one camera twice: they sit at one place
     found = solve(gathered.cameras, (), SETTINGS.calibration, rig=True)
     files = write_files(tmp_path, found, SETTINGS)
-    assert [f.name for f in files] == ["left.toml", "left.png", "right.toml", "right.png"]
+    assert [f.name for f in files] == ["left.toml", "right.toml"]
     mount = load_mount(tmp_path / "right.toml")
     assert mount is not None and np.allclose(mount, np.eye(4), atol=1e-6)
     np.testing.assert_array_equal(mount, found.rig["right"].T_rig_camera)
@@ -135,7 +134,7 @@ def test_a_pair_that_gives_its_images_side_by_side_becomes_one_file(tmp_path: Pa
     (tmp_path / "board.toml").write_text(BOARD_FILE)
     run_ok("calibrate", "--stereo", folder, "--config", tmp_path / "board.toml", "--out", tmp_path / "made")
     made = sorted(file.name for file in (tmp_path / "made").iterdir())
-    assert made == ["stereo-left.png", "stereo-right.png", "stereo.toml"]
+    assert made == ["stereo.toml"]
     pair = load_stereo(tmp_path / "made" / "stereo.toml")
     assert pair.swapped is swapped
     assert abs(pair.left.fx / LENS.fx - 1) < 0.005 and abs(pair.right.fx / lens.fx - 1) < 0.005
