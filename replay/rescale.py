@@ -27,7 +27,7 @@ from semantic_mapper.replay.sfm.scale import scale_by_floor, scene_depth
 from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary
 from semantic_mapper.transport.codec import scaled_frame
 from semantic_mapper.transport.messages import SCALE_KEY, SCENE_DEPTH_KEY
-from semantic_mapper.types import Float32, Float64
+from semantic_mapper.types import Float64
 
 _NEAR = 0.1  # of the map's extent: a given point lies no farther from its surface
 _FLOOR_CONE_DEG = 5.0  # how far up may be off z
@@ -35,13 +35,10 @@ _FLOOR_CONE_DEG = 5.0  # how far up may be off z
 
 @dataclass(frozen=True, slots=True)
 class RescaleReport:
-    """What has changed. Of two lengths the first is in the unit of before, the second in metres."""
+    """What has changed."""
 
     factor: float  # metres in a unit of before
-    scale_before: str  # how it was found; "unknown"
-    scale: str  # how it is found now
-    way_m: tuple[float, float]  # of the camera
-    height_m: tuple[float, float]  # of the mapped surface along z, but for its lowest and highest hundredth
+    scale: str  # how it is found
     summary: dict[str, Any]  # of the new map; where its `stopped_by` says something, all is as it was
 
 
@@ -84,15 +81,13 @@ def rescale_run(
             for _, parts in reader.frame_parts():
                 writer.write_parts(scaled_frame(parts, factor))
         count = 0 if summary.get("stopped_by") else int(dig(summary, "frames.published") or 0)
-        new, session = replay_log(scaled, made, weights or Path(name.stem), config, count, monitor=monitor)
+        new, _ = replay_log(scaled, made, weights or Path(name.stem), config, count, monitor=monitor)
         if not new["stopped_by"]:
             clear_results(folder)
             os.replace(scaled, folder / log.name)
             for file in sorted(made.iterdir(), key=lambda file: file.name == SUMMARY_FILE):  # that of a whole result
                 os.replace(file, folder / file.name)
-    way = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-    heights = _height(xyz), _height(session.pipeline.voxel_map.points().xyz)
-    return RescaleReport(factor, old.get(SCALE_KEY, "metres"), scale, (way, factor * way), heights, new)
+    return RescaleReport(factor, scale, new)
 
 
 def _find_log(folder: Path) -> Path:
@@ -138,7 +133,3 @@ def _factor(
     if apart < 1e-6:
         raise MapError("the two points are one; give two that are far apart")
     return metres / apart, f"two points of the map, {metres:g} m apart"
-
-
-def _height(xyz: Float64 | Float32) -> float:
-    return float(np.ptp(np.percentile(xyz[:, 2], (1, 99)))) if len(xyz) else 0.0

@@ -10,13 +10,11 @@ import typer
 
 from semantic_mapper.config import AtLeastZero
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.mapping import show_result
 from semantic_mapper.nodes.cli.verb import JsonOutput, WeightsOption, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.exporters.map_files import parse_numbers
-from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 
@@ -53,12 +51,8 @@ def scale(
         if report.summary["stopped_by"]:
             stderr_console().print(f"stopped by {stop.name}; {run} is as it was", style="yellow")
             return stop.exit_code
-    unit = length_unit(report.scale_before != SCALE_UNKNOWN)
     output.json(asdict(report))
-    output.print(f"{run}: lengths are {report.factor:.4g} times those of before, in metres")
-    output.print(f"  scale: {report.scale} (before: {report.scale_before})")
-    for name, (before, after) in (("way", report.way_m), ("height of what is mapped", report.height_m)):
-        output.print(f"  {name}: {after:.2f} m (before: {before:.2f} {unit})")
+    output.print(f"{run}: lengths are {report.factor:.4g} times those of before, in metres; scale: {report.scale}")
     show_result(output, report.summary, run)
     return 0
 
