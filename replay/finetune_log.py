@@ -35,7 +35,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.frame_depth import FrameDepth
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.boxes import QUERY_MARGIN_M, load_boxes, with_classes, with_times
+from semantic_mapper.replay.boxes import QUERY_MARGIN_M, load_boxes, with_classes
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -141,7 +141,6 @@ def _finetune_boxes(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Chec
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
         boxes, label_set = with_classes(boxes, labels.label_set, request.boxes, labels.source)
-        boxes, dropped = with_times(boxes, request.boxes, log)
         source = FrameSource(log, None, request, monitor, _compute_depths(log, request.depth, monitor))
         frames = source.pseudo_labelled(labels)
         note = read_note(log.attachments())
@@ -155,9 +154,7 @@ def _finetune_boxes(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Chec
     if note is not None and any(f.label_is_pseudo for f in frames):
         seen |= frozenset(note.train_stamps_ns)
     checkpoint = _fit(request, monitor, frames, label_set, Panoptic(config, label_set), seen, Panoptic.kind)
-    figures = checkpoint.recipe["panoptic"]
-    figures |= {"left_out": boxes.left_out, "unseen": int((~in_view).sum()), "pseudo": labels.source}
-    figures["lost"] += len(dropped)
+    checkpoint.recipe["panoptic"] |= {"unseen": int((~in_view).sum()), "pseudo": labels.source}
     return checkpoint, []
 
 

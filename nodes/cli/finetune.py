@@ -129,7 +129,6 @@ def _recipe_lines(recipe: dict[str, Any], chosen: int) -> list[str]:
         left_out = {
             "unseen": "that no frame sees",
             "lost": "that move, which no frame shows at their times",
-            "left_out": "of no class, or of one that the labels lack",
         }
         if any(boxed[name] for name in left_out):
             reasons = (f"{boxed[name]} {reason}" for name, reason in left_out.items() if boxed[name])

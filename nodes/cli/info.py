@@ -276,13 +276,12 @@ def _boxes_info(output: Output, file: Path) -> dict[str, Any]:
         (
             *(box["id"], box["class"], box["shape"], "yes" if box["thing"] else "no"),
             *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
-            len(box["stamps_ns"]) or len(box["frames"]) or "always",
+            len(box["stamps_ns"]) or "always",
         )
         for box in found["boxes"]
     ]
-    caption = f"left out: {found['left_out']} of no class" if found["left_out"] else ""
     names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
-    output.print(table(rows, names, title=str(file), caption=caption))
+    output.print(table(rows, names, title=str(file)))
     return found
 
 
@@ -297,9 +296,8 @@ def _describe_boxes(found: BoxFile) -> dict[str, Any]:
             "center": np.round(box.T_world_box[:3, 3], 4).tolist(),
             "size": np.round(box.size, 4).tolist(),
             "stamps_ns": [stamp for stamp, _ in box.stamps or ()],
-            "frames": [number for number, _ in box.frames or ()],
         }
         for box in found.primitives
     ]
     merge = {name: list(rest) for name, rest in found.merge.items()}
-    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": list(found.bad)}
+    return {"boxes": listed, "merge": merge}

@@ -43,7 +43,6 @@ from semantic_mapper.replay.importers.tables import (
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERAS = ("image_00", "image_01")
-SOURCE = "kitti360 "  # begins the name of the source of such logs, whose frames have the numbers of the drive
 NOMINAL_HZ = 10.0  # of drives whose timestamps.txt is not there
 _CLASSES = (  # from id 7 on
     "road 804080|sidewalk f423e8|parking faaaa0|rail track e6968c|building 464646|wall 66669c|fence be9999|"
@@ -130,7 +129,7 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
         return depth_of_scan(points, T_camera_scanner, intrinsics)
 
     return PosedPictures(
-        f"{SOURCE}{drive}",
+        f"kitti360 {drive}",
         pictures,
         options,
         DepthScale(1000.0, convention="depth comes from laser scans, in metres"),

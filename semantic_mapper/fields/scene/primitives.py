@@ -41,19 +41,17 @@ class Primitive:
     faces: Int64 | None = None
     # Of one that moves: (ns, (4, 4) pose) at each time that is known
     stamps: tuple[tuple[int, Float64], ...] | None = None
-    # Of one that moves, whose times are not known: (number of a frame of its drive, (4, 4) pose) instead
-    frames: tuple[tuple[int, Float64], ...] | None = None
 
     @property
     def moves(self) -> bool:
         """Whether it is at different places at different times."""
-        return self.stamps is not None or self.frames is not None
+        return self.stamps is not None
 
     def pose_at(self, stamp_ns: int) -> Float64 | None:
-        """Its pose (4, 4) at a time, between two stamps on the way from one to the other; None where its times are not
-        known, and by more than half of the median gap of the stamps before the first or after the last."""
+        """Its pose (4, 4) at a time, between two stamps on the way from one to the other; None by more than half of
+        the median gap of the stamps before the first or after the last."""
         if self.stamps is None:
-            return self.T_world_box if self.frames is None else None
+            return self.T_world_box
         known = sorted(self.stamps, key=lambda entry: entry[0])
         times = np.array([t for t, _ in known], np.int64)
         beyond = max(int(times[0]) - stamp_ns, stamp_ns - int(times[-1]))
@@ -75,11 +73,8 @@ class Primitive:
 
 def moved(box: Primitive, move: Callable[[Float64], Float64]) -> Primitive:
     """A primitive with all its poses (4, 4) changed alike."""
-
-    def each(known: tuple[tuple[int, Float64], ...] | None) -> tuple[tuple[int, Float64], ...] | None:
-        return None if known is None else tuple((when, move(pose)) for when, pose in known)
-
-    return replace(box, T_world_box=move(box.T_world_box), stamps=each(box.stamps), frames=each(box.frames))
+    stamps = None if box.stamps is None else tuple((when, move(pose)) for when, pose in box.stamps)
+    return replace(box, T_world_box=move(box.T_world_box), stamps=stamps)
 
 
 def centred(box: Primitive) -> Primitive:

@@ -118,12 +118,8 @@ def test_a_stop_leaves_no_images_of_things(log: Path, fitted: tuple[Path, str], 
 def test_boxes_that_do_not_fit_are_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
     wrong, text = tmp_path / "wrong.json", boxes.read_text()
     command = ("finetune", log, "--kind", "panoptic", "--boxes", wrong, "--out", tmp_path / "w.safetensors")
-    for changed, said in (
-        (text.replace('"class": "', '"class": "x', 1), "box with id 9: label set 'rooms' has no class"),
-        (text.replace('"stamps"', '"frames"'), "give the log that `import` made of the drive"),
-    ):
-        wrong.write_text(changed)
-        assert said in refused(*command)
+    wrong.write_text(text.replace('"class": "', '"class": "x', 1))
+    assert "box with id 9: label set 'rooms' has no class" in refused(*command)
     options = ("--weights", weights, "--instances", tmp_path / "i", "--out", tmp_path / "n.mcap")
     assert "has no boxes" in refused("autolabel", log, *options) and not (tmp_path / "i").exists()
 
