@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from research.evaluation.trajectory import absolute_trajectory_error
 from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from research.scenes.config import PoseNoiseConfig
 from research.scenes.pose_noise import drifting_poses
@@ -28,7 +29,6 @@ from semantic_mapper.config import PoseRefinerConfig, convert_config
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource
-from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from research.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.bundle.keyframes import BundleProblem, adjust_bundle
 from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose
 from semantic_mapper.config import PoseRefinerConfig
-from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import project
 from semantic_mapper.types import Float64, PosedFrame
 

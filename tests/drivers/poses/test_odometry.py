@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from research.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses import loop_closure, odometry
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.errors import CameraError
-from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.drawn_room import truth_of, walk_frames
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from research.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import VisualPoses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource, two_views
-from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import look_at, project
 from semantic_mapper.nodes.camera.live import with_poses
 from semantic_mapper.nodes.options import LiveCamera
