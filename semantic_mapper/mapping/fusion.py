@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.errors import ConfigError, FrameError, ShapeError
+from semantic_mapper.config import VoxelMapConfig, convert_config, to_plain
+from semantic_mapper.errors import FrameError, ShapeError
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.allocation import Camera
@@ -31,19 +31,10 @@ SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surfa
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
 
-_BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
-    "voxel_size_m": (1e-4, 10.0),
-    "depth_max_m": (1e-3, 1000.0),
-    "max_blocks": (1, 1 << 27),
-}
-
 
 def make_limits(config: VoxelMapConfig) -> FusionLimits:
     """Limits of a map; ``ConfigError`` where no map can be built with a value."""
-    for name, (least, most) in _BOUNDS.items():
-        value = getattr(config, name)
-        if not least <= value <= most:  # NaN, too
-            raise ConfigError(f"voxel_map.{name} must be from {least:g} to {most:g}, got {value}")
+    convert_config(to_plain(config), VoxelMapConfig, "voxel_map")  # structs made in Python are not checked
     return FusionLimits(
         voxel_size=config.voxel_size_m,
         truncation=config.truncation_voxels * config.voxel_size_m,
@@ -152,7 +143,6 @@ def fuse_blocks(
 @parallel_kernel()
 def _log_probability_rows(count: int, probabilities: Float32, logs: Float32, proper: Bool) -> None:
     """Floored log of rows (K, L), and whether each (K,) is of numbers that are not negative and sum to 1."""
-    ...
 
 
 @parallel_kernel()
@@ -168,7 +158,6 @@ def _vote_weights(
 ) -> None:
     """Weigh votes (H, W): |cos| of the angle between ray and surface normal, from four neighbours, times nearness;
     ``bad`` (H,) counts known pixels of each image row whose row of the table is not ``proper`` (K,)."""
-    ...
 
 
 @parallel_kernel(chunks_per_thread=4)
@@ -198,4 +187,3 @@ def vote_into_blocks(
     max_votes: float,
 ) -> None:
     """Vote as ``fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else."""
-    ...
