@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from semantic_mapper.config import MapperConfig, convert_config, load_config, to_plain, with_quality
+from msgspec.structs import replace
+
+from semantic_mapper.config import MapperConfig, load_config, with_quality
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, find_checkpoint, load_checkpoint
 from semantic_mapper.fields.device import DeviceField, choose_device
@@ -44,9 +46,7 @@ class Mapper:
         path = default_checkpoint_path() if weights is None else find_checkpoint(Path(weights))
         checkpoint = load_checkpoint(path)
         if config.render.encode_width == 0:
-            plain = to_plain(config)
-            plain["render"]["encode_width"] = checkpoint.width
-            config = convert_config(plain, MapperConfig, "mapper config")
+            config = replace(config, render=replace(config.render, encode_width=checkpoint.width))
         field = make_field(checkpoint.model, config)
         pipeline = MappingPipeline(config, field, checkpoint.label_set, anchors=checkpoint.anchors)
         network = field.model if isinstance(field, DeviceField) else checkpoint.model
