@@ -169,7 +169,6 @@ def draw_borders_to_edges(
     advantage: float,
 ) -> None:
     """The filter of ``depth_prior``: ``count`` rows, from depth without holes and with, (H, W) each, into ``out``."""
-    ...
 
 
 def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:

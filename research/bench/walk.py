@@ -115,7 +115,7 @@ def bench_walk(
             log.note(visit, frame, *timed_step(pipeline, frame))
             on_frame(log.frames)
         if not visit.returning and visit.room < plan.returns:
-            keys = pipeline.voxel_map.changed_since(entered)
+            keys = pipeline.voxel_map.changes(entered).keys
             left[visit.room] = keys, _digest(pipeline.voxel_map, keys)
     return {
         "rooms": plan.rooms,

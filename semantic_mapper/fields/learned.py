@@ -82,14 +82,14 @@ class LearnedField(nn.Module, ABC):
         measured depth; False = no choice."""
         return False
 
-    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
+    def sample(self, rays: RayBatch, sources: EncodedViews) -> torch.Tensor:
         """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
         if self.sampling.mode == "streaming":
             return sample_guided(rays, self.sampling)
-        coarse = sample_inverse_depth(rays.near_m, rays.far_m, self.sampling.coarse, generator)
+        coarse = sample_inverse_depth(rays.near_m, rays.far_m, self.sampling.coarse)
         with torch.no_grad():
             _, weights = self.render_samples(rays, coarse, sources)
-        fine = sample_from_weights(coarse, weights, self.sampling.fine, generator)
+        fine = sample_from_weights(coarse, weights, self.sampling.fine)
         return merge_samples(coarse, fine)
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:

@@ -170,7 +170,6 @@ def render_sray(
     count: int, rays: _Rays, maps: _SourceMaps, settings: _Settings, weights: _Weights, out: _Rendered
 ) -> None:
     """Render ``count`` rays into ``out``, before the classifier; see ``SRay.render_samples``."""
-    ...
 
 
 def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:

@@ -59,22 +59,16 @@ def around_computed(config: SamplingConfig) -> SamplingConfig:
     )
 
 
-def sample_from_weights(
-    z: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None = None
-) -> torch.Tensor:
-    """Draw ``count`` depths from the piecewise-constant distribution that ``weights`` (R, N) put on intervals round z:
-    inverse-CDF sampling in inverse depth, evenly spaced quantiles without a generator. Not differentiable."""
+def sample_from_weights(z: torch.Tensor, weights: torch.Tensor, count: int) -> torch.Tensor:
+    """Depths (R, count) at evenly spaced quantiles of the piecewise-constant distribution that ``weights`` (R, N) put
+    on intervals round z: inverse-CDF sampling in inverse depth. Not differentiable."""
     inv = 1 / z
     mid = (inv[:, 1:] + inv[:, :-1]) / 2
     edges = torch.cat((inv[:, :1], mid, inv[:, -1:]), dim=1)  # (R, N + 1)
     pdf = weights.detach() + 1e-5
     cdf = torch.cumsum(pdf / pdf.sum(dim=1, keepdim=True), dim=1)
     cdf = torch.cat((torch.zeros_like(cdf[:, :1]), cdf), dim=1)  # (R, N + 1)
-    shape = (len(z), count)
-    if generator is None:
-        u = (torch.arange(count, dtype=z.dtype, device=z.device) + 0.5).expand(shape) / count
-    else:
-        u = torch.rand(shape, generator=generator, dtype=z.dtype, device=z.device)
+    u = (torch.arange(count, dtype=z.dtype, device=z.device) + 0.5).expand(len(z), count) / count
     upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, z.shape[1])
     lower = upper - 1
     c0, c1 = cdf.gather(1, lower), cdf.gather(1, upper)

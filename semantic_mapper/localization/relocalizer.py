@@ -79,7 +79,6 @@ class MapSurface(Protocol):
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> Any:
         """The map as a camera would see it: depth_m, rgb, label and confidence, (H, W) each."""
-        ...
 
 
 class Relocalized(NamedTuple):

@@ -147,4 +147,3 @@ def _collect_block_keys(
     """Packed keys of the blocks of each of the ``bands`` of an image, each once, in no order: ``keys`` (bands,
     capacity), ``counts`` (bands,), which are more than the capacity, a power of two, where there is no room for all.
     ``slots`` (bands, 2 * capacity) of -1 is scratch, a hash set."""
-    ...

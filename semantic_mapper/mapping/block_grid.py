@@ -416,4 +416,3 @@ def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
 @kernel
 def blocks_hold_surface(indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
     """Which blocks (B,) have a voxel that may have to be cleared one day (``mapping/clearing.py``): 0 or 1 to fill."""
-    ...

@@ -72,7 +72,6 @@ def find_blocks(index: BlockIndex, packed: Int64) -> Int32:
 @kernel
 def insert_blocks(index: BlockIndex, packed: Int64, values: Int32) -> None:
     """Add keys (B,) that are not in the table yet, with their buffer indices (B,); ``has_room`` must say yes."""
-    ...
 
 
 @kernel
@@ -249,13 +248,11 @@ def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows
 @kernel
 def packed_block_ends(weight: Float32, votes: Float32, rows: Int32, ends: Int64, classes: int) -> None:
     """Where packed blocks begin and end (B + 1,), in units of float32; ``rows`` (B,) of them."""
-    ...
 
 
 @kernel
 def pack_block_values(values: BlockValues, rows: Int32, ends: Int64, data: Float32) -> None:
     """Write blocks ``rows`` (B,) as ``PackedBlocks`` says to ``data`` (N,), which is zero; ``ends`` (B + 1,)."""
-    ...
 
 
 @kernel

@@ -151,4 +151,3 @@ def _compact_blocks(
     computed: UInt8,
 ) -> None:
     """Write packed blocks (B,) to ``rows`` (B,) of the output; ``ids`` (L + 1,) of the classes, and the ignore id."""
-    ...

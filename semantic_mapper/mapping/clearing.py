@@ -131,7 +131,6 @@ def _blocks_before_depth(
     count: int, keys: Int32, considered: UInt8, camera: Camera, voxel_size: float, bounds: DepthBounds, found: UInt8
 ) -> None:
     """Which of the blocks (B, 3) that are ``considered`` (B,) may have a voxel in front of the depth: (B,) to fill."""
-    ...
 
 
 @parallel_kernel(chunks_per_thread=4)
@@ -146,11 +145,9 @@ def _clear_blocks(
     cleared: Int64,
 ) -> None:
     """Weaken voxels that the frame sees through where ``changes``; count them, and those that were cleared: (B,)."""
-    ...
 
 
 # Serial: it takes less time than to wake another thread would.
 @kernel
 def _bound_depth(depth: Float32, depth_max: float, bounds: DepthBounds) -> None:
     """Fill the bounds."""
-    ...

@@ -117,10 +117,8 @@ def _resample_blocks(
 ) -> None:
     """Interpolate a source at voxels of other blocks (B, 3): their point p is the source's ``R @ (p - t)`` in
     voxels."""
-    ...
 
 
 @parallel_kernel()
 def _add_block_values(count: int, blocks: Int32, buffers: GridBuffers, added: BlockValues, cap: float) -> None:
     """Add blocks ``added`` to those with buffer indices ``blocks`` (B,), in place."""
-    ...

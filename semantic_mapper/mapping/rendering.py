@@ -200,7 +200,6 @@ def upsample(
 @parallel_kernel()
 def find_one_class(count: int, channel: Int64, one_class: Bool) -> None:
     """Whether the 3x3 coarse pixels round each (h, w) are known and of one class; ``count`` is h."""
-    ...
 
 
 @parallel_kernel()
@@ -219,4 +218,3 @@ def upsample_view(
     least_weight: float,
 ) -> None:
     """``upsample`` of ``count`` rows; ``look`` (h, w, 4) is colour and depth of the coarse pixels."""
-    ...

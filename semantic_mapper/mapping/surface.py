@@ -187,7 +187,6 @@ def _cast_view_rows(
     seen: Readout,
 ) -> None:
     """Fill the rows of a window of what ``cast_view`` returns."""
-    ...
 
 
 @parallel_kernel()
@@ -201,7 +200,6 @@ def _read_map_points(
     read: Readout,
 ) -> None:
     """Fill what ``read_points`` returns."""
-    ...
 
 
 @parallel_kernel()
@@ -209,7 +207,6 @@ def _count_crossings(
     count: int, keys: Int32, blocks: Int32, index: BlockIndex, buffers: GridBuffers, min_weight: float, counts: Int64
 ) -> None:
     """Crossings of each block (B,); keys (B, 3), buffer indices (B,)."""
-    ...
 
 
 @parallel_kernel()
@@ -224,4 +221,3 @@ def _write_crossings(
     points: Float64,
 ) -> None:
     """The crossings of block n, in units of voxels, into ``points[starts[n] : starts[n + 1]]``; points (N, 3)."""
-    ...

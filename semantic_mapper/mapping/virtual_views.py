@@ -247,4 +247,3 @@ def _sum_surface_patches(
 ) -> None:
     """Sums over the surface voxels, of a TSDF up to ``near``, of blocks with keys (B, 3) and buffer indices (B,): of
     positions in voxels (B, 3), need as of ``SurfacePatches`` (B,), and how many (B,)."""
-    ...

@@ -106,12 +106,6 @@ class VoxelMap:
         """Those of them that are on disk because of ``memory_mb``."""
         return self._grid.stored_count
 
-    def changed_since(self, version: int) -> Int32:
-        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order; of a new ``epoch``,
-        all."""
-        with _KERNEL_LOCK:
-            return unpack_keys(self._grid.versions_since(version)[0])
-
     def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
         """The blocks changed after ``version`` was ``since`` (0: the whole map), in compact form.
 

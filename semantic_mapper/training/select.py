@@ -43,7 +43,7 @@ def choose_keyframes(candidates: Sequence[Candidate], count: int, seed: int) -> 
     count = min(count, len(candidates))
     if any(len(c.cells) == 0 for c in candidates):
         return sorted({int(i) for i in np.linspace(0, len(candidates) - 1, count + 2)[1:-1].round()})
-    owner, cell, worth = _cells(candidates, None)
+    owner, cell, worth = _cells(candidates)
     rng = np.random.default_rng(seed)
     chosen: list[int] = []
     while len(chosen) < count:
@@ -66,20 +66,15 @@ class Suggestion:
     shown: float | None  # fraction that all of them show then; None likewise
 
 
-def suggest_frames(
-    candidates: Sequence[Candidate],
-    count: int,
-    labelled: Collection[int] = (),
-    weights: Sequence[Float64] | None = None,
-) -> list[Suggestion]:
+def suggest_frames(candidates: Sequence[Candidate], count: int, labelled: Collection[int] = ()) -> list[Suggestion]:
     """The most useful frames to label, best first; fewer where the others would add nothing.
 
     Where no candidate has depth, each suggestion is the frame farthest in time from all labelled ones. ``labelled``:
-    indices of candidates. ``weights``: (P,) what each pixel of a candidate counts; None = all alike.
+    indices of candidates.
     """
     if not any(len(c.cells) for c in candidates):
         return [Suggestion(index, None, None) for index in _farthest_in_time(candidates, count, labelled)]
-    owner, cell, worth = _cells(candidates, weights)
+    owner, cell, worth = _cells(candidates)
     total = worth.sum()
     taken = list(labelled)
     worth[cell[np.isin(owner, taken)]] = 0
@@ -96,14 +91,12 @@ def suggest_frames(
     return found
 
 
-def _cells(
-    candidates: Sequence[Candidate], weights: Sequence[Float64] | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
+def _cells(candidates: Sequence[Candidate]) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
     """Pairs of a candidate and a cell that it shows, each once: both (Q,); and what each cell is worth."""
     sizes = [len(c.cells) for c in candidates]
     _, cell = np.unique(np.concatenate([c.cells for c in candidates]), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
-    worth = np.bincount(cell, weights=None if weights is None else np.concatenate(weights)).astype(np.float64)
+    worth = np.bincount(cell).astype(np.float64)
     pairs = np.unique(np.stack((np.repeat(np.arange(len(candidates)), sizes), cell), axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1], worth
 

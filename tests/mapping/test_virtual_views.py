@@ -88,7 +88,7 @@ def test_a_vote_weighs_its_share_of_that_of_a_frame_and_nothing_else_changes():
     before, frames, version = geometry(silent), silent.frames, silent.version
     touched = vote(silent, depth)
     assert geometry(silent) == before and silent.frames == frames
-    assert silent.version == version + 1 and len(silent.changed_since(version)) == touched > 0
+    assert silent.version == version + 1 and len(silent.changes(version).keys) == touched > 0
     ours, frames_votes = silent.block_state(), voted.block_state()
     assert frames_votes["votes"].max() > 0.9
     np.testing.assert_allclose(ours["votes"], VOTE_WEIGHT * frames_votes["votes"], rtol=1e-5)

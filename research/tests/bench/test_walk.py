@@ -99,7 +99,7 @@ def test_what_comes_back_is_what_a_map_without_a_limit_holds() -> None:
             votes = 0.9 * np.eye(len(whole.label_set), dtype=np.float32) + np.float32(0.1 / len(whole.label_set))
             for voxel_map in (whole, paged):
                 voxel_map.integrate(frame, frame.depth_m, votes / votes.sum(axis=1, keepdims=True), rows=rows)
-        keys = whole.changed_since(0) * 0.4  # metres
+        keys = whole.changes(0).keys * 0.4  # metres
         assert (((keys > visit.low - 0.4) & (keys < visit.high)).all(axis=1)).any()
     assert paged.stored_blocks > 500
     one, other = whole.block_state(), paged.block_state()
