@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, adjust_bundle, triangulate
-from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.scale import ScaleEstimator, find_floor
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate, PoseSource
@@ -24,6 +23,7 @@ from semantic_mapper.geometry import camera_matrix, interpolate_pose, invert_pos
 from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.localization.features import match_features, pose_from_points
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.picture_check import PictureQuality
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 _WIDTH, _CORNERS, _WINDOW = 640, 300, 10  # of the images that corners are followed in; keyframes adjusted together
@@ -58,7 +58,7 @@ class VisualPoseSource(PoseSource):
 
     Attributes:
         counters: "tracked" images, "lost" ones, "waiting" ones before the world began, "relocalised", "keyframes",
-            "without_scale": images that had no pose because the scale was not known yet; what ``PictureChecker``
+            "without_scale": images that had no pose because the scale was not known yet; what ``PictureQuality``
             counts; with "scale_" before them, those of the reference.
     """
 
@@ -67,7 +67,7 @@ class VisualPoseSource(PoseSource):
         self._config = config
         self._reference = reference
         self._odometry: VisualOdometry | None = None
-        self._checks = PictureChecker()
+        self._checks = PictureQuality()
         self._estimator = ScaleEstimator()
         self._metric = False
         self._world_begun = False

@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
-from semantic_mapper.bundle.picture_checks import SENTENCES as PICTURE_SENTENCES
-from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.geometry import invert_pose, project, rotation_vector, scale_intrinsics, transform
 from semantic_mapper.log_events import get_logger, is_power_of_two
@@ -23,6 +21,13 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 _log = get_logger(__name__)
 
 MAX_CAMERAS = 64  # that something is kept of
+# Of pictures by themselves:
+_SIDE = 160  # pixels that pictures are judged in
+_DARK = 24.0  # grey level that hardly any pixel of a dark picture reaches
+_JUMP = 0.5  # of the mean brightness, natural logarithm, from one picture to the next
+_BLUR = 0.35  # of the median sharpness of the pictures before
+_SHARPNESS_OF = 15  # pictures that sharpness is compared with
+# And with their poses:
 _WIDTH = 320  # pixels that pictures are judged at
 _CORNERS, _KEYFRAMES = 200, 6
 _LEAST = 20  # corners that a judgement takes
@@ -39,11 +44,43 @@ _SCALED = 0.02  # of the width by which corners may still be off once the pictur
 _RANSAC_PX = 2.0
 _RECENT = 30  # pictures that a warning lasts
 REFUSED = ("dark", "blurred", "still_pictures", "focal_change")  # would spoil a map of computed depth
-SENTENCES = PICTURE_SENTENCES | {
+SENTENCES = {
+    "dark": "pictures are too dark: more light, or a longer exposure",
+    "blurred": "pictures are blurred: move the camera more slowly, or give it more light",
+    "exposure_jump": "the exposure jumps from picture to picture: fix it, or let it change more slowly",
     "still_pictures": "poses move, but pictures do not: is the camera frozen, or do the poses belong to another one?",
     "misfit": "poses do not fit the pictures: check their stamps, T_world_camera or T_base_camera, and the calibration",
     "focal_change": "the focal length has changed (zoom or autofocus), so the calibration does not hold: fix the lens",
 }
+
+
+class PictureQuality:
+    """Judges the pictures of one camera by themselves, in their order."""
+
+    def __init__(self) -> None:
+        self._sharpness: deque[float] = deque(maxlen=_SHARPNESS_OF)
+        self._brightness: float | None = None
+        self.counters: Counter[str] = Counter()  # pictures by what was wrong, a name of ``SENTENCES``
+        self.warnings: tuple[str, ...] = ()  # a sentence for each thing that is wrong with the last picture
+
+    def look(self, rgb: UInt8) -> tuple[str, ...]:
+        """Judge the next picture (H, W, 3); the names of what is wrong."""
+        size = _SIDE, max(1, round(_SIDE * rgb.shape[0] / rgb.shape[1]))
+        gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+        before, self._brightness = self._brightness, float(np.log(gray.mean() + 1.0))
+        if np.percentile(gray, 95) < _DARK:
+            found = ["dark"]
+        else:
+            # Edges against contrast: a dim picture is as sharp as a bright one.
+            sharp = float(cv2.Laplacian(gray, cv2.CV_32F).var() / (gray.var() + 1.0))
+            usual = float(np.median(self._sharpness)) if len(self._sharpness) >= _SHARPNESS_OF // 3 else 0.0
+            found = ["blurred"] if sharp < _BLUR * usual else []
+            if before is not None and abs(self._brightness - before) > _JUMP:
+                found.append("exposure_jump")
+            self._sharpness.append(sharp)
+        self.counters.update(found)
+        self.warnings = tuple(SENTENCES[name] for name in found)
+        return tuple(found)
 
 
 class PictureCheck:
@@ -98,7 +135,7 @@ class _CameraCheck:
         self._small = scale_intrinsics(intrinsics, width, round(intrinsics.height * width / intrinsics.width))
         self._tracker = Tracker(_CORNERS)
         self._points = KeyframeMap(self._small, _KEYFRAMES)
-        self._pictures = PictureChecker()
+        self._pictures = PictureQuality()
         self._brightness: UInt8 | None = None
         self._anchor: tuple[Tracks, Float64] | None = None  # the last picture that had moved, and its pose
         self._focal: deque[float] = deque(maxlen=_FOCAL_TIMES)

@@ -4,16 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.bundle.picture_checks import PictureChecker
+from semantic_mapper.mapping.picture_check import PictureQuality
 from semantic_mapper.types import UInt8
-
-from .rooms import walk
+from tests.bundle.rooms import walk
 
 PICTURES: list[UInt8] = [f.rgb for f in walk()[:12]]
 
 
 def test_a_walk_of_sharp_pictures_gives_no_cause_for_complaint_and_a_dim_one_is_not_blurred() -> None:
-    checker = PictureChecker()
+    checker = PictureQuality()
     assert [checker.look(rgb) for rgb in PICTURES] == [()] * 12
     assert not checker.counters and checker.warnings == ()
     assert "blurred" not in checker.look((PICTURES[-1] * 0.5).astype(np.uint8))
@@ -21,7 +20,7 @@ def test_a_walk_of_sharp_pictures_gives_no_cause_for_complaint_and_a_dim_one_is_
 
 @pytest.mark.parametrize("name", ["dark", "blurred", "exposure_jump"])
 def test_what_is_wrong_with_a_picture_is_named_and_counted(name: str) -> None:
-    checker = PictureChecker()
+    checker = PictureQuality()
     for rgb in PICTURES[:-1]:
         checker.look(rgb)
     last = PICTURES[-1]
