@@ -39,7 +39,7 @@ from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.sockets import QueryServer
 
 PERIOD_S = 0.1  # between two snapshots, at least
-MAX_BLOCKS = 600  # copied between two frames (unless one frame has more): bounds what a step may cost
+MAX_BLOCKS = 600  # copied between two frames, and the rest of a frame: bounds what a step may cost
 LISTENED_S = 1.0  # without a question for so long, no more snapshots are made
 CATCH_UP_S = 4.0  # without another copy for so long, questions wait no longer for the present map
 MAX_WAITING, MAX_OF_CLIENT = 64, 8  # questions that wait, of all clients and of one
@@ -47,7 +47,7 @@ MAX_WAITING, MAX_OF_CLIENT = 64, 8  # questions that wait, of all clients and of
 MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
 MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
-MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, unless one version has more
+MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, and the rest of a version
 _MAX_TRACKERS = 4  # one for each direction that was called up
 _POLL_S = 0.5
 _NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"

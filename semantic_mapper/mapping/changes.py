@@ -121,8 +121,9 @@ def packed_parts(grid: BlockGrid, packed: Int64) -> Iterator[tuple[Int64, Packed
 
 
 def oldest_first(versions: Int64, since: int, limit: int, newest: int) -> tuple[Int64, int]:
-    """Which of the blocks (B,) changed after ``since`` come first: ascending positions of whole versions, at least one,
-    else at most ``limit`` blocks (0 = all); and the version that they complete, ``newest``, the map's, where it is all.
+    """Which of the blocks (B,) changed after ``since`` come first: ascending positions, of whole versions until it is
+    ``limit`` blocks or more (0 = all); and the version that they complete, ``newest``, the map's, where it is all.
+    Else a frame with more blocks would never come while each frame leaves some of the frames before it behind.
     ``MapError``: ``since`` is no version of the map, or ``limit`` is negative."""
     if not 0 <= since <= newest or limit < 0:
         raise MapError(
@@ -132,8 +133,7 @@ def oldest_first(versions: Int64, since: int, limit: int, newest: int) -> tuple[
     if not limit or len(versions) <= limit:
         return np.arange(len(versions)), newest
     distinct, counts = np.unique(versions, return_counts=True)
-    whole = max(1, int(np.searchsorted(np.cumsum(counts), limit, side="right")))
-    version = int(distinct[whole - 1])
+    version = int(distinct[np.searchsorted(np.cumsum(counts), limit)])
     return np.flatnonzero(versions <= version), version
 
 

@@ -109,10 +109,10 @@ class VoxelMap:
     def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
         """The blocks changed after ``version`` was ``since`` (0: the whole map), in compact form.
 
-        At most ``limit`` blocks (0 = all), those that wait longest, but whole versions (a frame; a loaded map is one
-        version): who asks on with the version they got comes to the present map. Voxels of less than ``min_weight``
-        count as not observed; 1 = only what was measured. ``MapError``: ``since`` is no version of this map, or a bad
-        ``limit`` or ``min_weight``."""
+        Those that wait longest, in whole versions (a frame; a loaded map is one version) until it is ``limit`` blocks
+        or more (0 = all): who asks on with the version they got comes to the present map. Voxels of less than
+        ``min_weight`` count as not observed; 1 = only what was measured. ``MapError``: ``since`` is no version of this
+        map, or a bad ``limit`` or ``min_weight``."""
         with _KERNEL_LOCK:
             return self._choose_changes(since, limit, min_weight).compact()
 

@@ -8,7 +8,7 @@ import pytest
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping import changes as changes_module
 from semantic_mapper.mapping.blocks import BlockValues, pack_blocks
-from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.changes import BlockChanges, oldest_first
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import decided, random_grid
 from tests.mapping.rendered_views import small_map
@@ -43,6 +43,15 @@ def test_asking_on_leads_to_the_present_map(limit: int) -> None:
     walk(voxel_map, 5)
     assert collect(voxel_map, limit, grow=4) == contents(voxel_map.changes(0))
     assert voxel_map.frames == 9
+
+
+def test_blocks_that_every_frame_changes_are_not_put_off_for_ever() -> None:
+    versions, since = np.zeros(400, np.int64), 0
+    for frame in range(1, 20):
+        versions[10 * frame : 10 * frame + 90] = frame  # the view moves on by 10 of its 90 blocks
+        if frame > 1:  # the first copy comes late
+            _, since = oldest_first(versions[versions > since], since, 50, frame)
+    assert since == frame
 
 
 @pytest.mark.slow
