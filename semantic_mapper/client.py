@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError, TransportError
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.floor_plan import Band, OccupancyGrid
 from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.checks import as_numbers
@@ -22,7 +23,7 @@ from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, Request, Weights
 from semantic_mapper.queries.snapshot import MapMirror
-from semantic_mapper.queries.surface import RayHits
+from semantic_mapper.queries.surface import RayHits, costmap
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import server_identity
 from semantic_mapper.transport.launches import LIVE, MapperAddress, find_mapper
@@ -135,6 +136,10 @@ class MapClient(Closing):
         """Distances to obstacles in a box; see ``queries.occupancy.distance_field``."""
         low, high = _point(lower, "lower"), _point(upper, "upper")
         return self._ask(questions.DistanceRequest(lower=low, upper=high, unknown_is_occupied=unknown_is_occupied))
+
+    def costmap(self, radius_m: float, *, up: ArrayLike | None = None, height_m: Band | None = None) -> OccupancyGrid:
+        """Where a round robot can be; computed here, from ``mirror``; see ``queries.surface.costmap``."""
+        return costmap(self.mirror().snapshot(), radius_m, up=up, height_m=height_m)
 
     def mirror(self) -> MapMirror:
         """A mirror of the map in this process, brought up to the present; for many queries, or large ones.

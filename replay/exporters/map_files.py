@@ -46,8 +46,6 @@ _OPTIONS: dict[str, tuple[Format, ...]] = {
     "up": ("glb", "grid"),
     **dict.fromkeys(("height", "resolution", "floor", "costs"), ("grid",)),
 }
-HEIGHT_M = (0.1, 1.8)  # what a robot of a person's height can hit; what is lower, it rolls over
-RESOLUTION_M = 0.05
 AXES = {sign + name: s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, name in enumerate("xyz")}
 
 
@@ -155,17 +153,14 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
 
 def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
     voxel = voxel_map.config.voxel_size_m
-    resolution = request.resolution if request.resolution is not None else max(RESOLUTION_M, voxel)
-    if resolution < voxel:
-        raise ConfigError(f"--resolution {resolution:g}: cells smaller than the map's voxels ({voxel:g} m) leave holes")
     cost_of = None if request.costs is None else read_costs(request.costs, voxel_map.label_set)
     points = voxel_map.points(request.min_weight)
     up = request.up if request.up is not None else find_up(points, voxel_map.label_set)
     points = sure_points(points, request.min_confidence)
-    grid = occupancy_grid(points, up, resolution, request.height or HEIGHT_M, request.floor, cost_of)
+    grid = occupancy_grid(points, up, voxel, request.height, request.floor, cost_of, request.resolution)
     files = write_map_server(path, grid)
-    area = {name: (grid.cells == value).sum() * resolution**2 for name, value in _STATES.items()}
-    content = f"{grid.cells.shape[1]} x {grid.cells.shape[0]} cells of {resolution:g} m: " + ", ".join(
+    area = {name: (grid.cells == value).sum() * grid.resolution_m**2 for name, value in _STATES.items()}
+    content = f"{grid.cells.shape[1]} x {grid.cells.shape[0]} cells of {grid.resolution_m:g} m: " + ", ".join(
         f"{square:.1f} m2 {name}" for name, square in area.items()
     )
     level = round(-float(grid.T_grid_world[2, 3]), 2) + 0.0  # never -0

@@ -12,19 +12,20 @@ only where the *floor* was seen and no surface stands above it:
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.upright import find_upright
 from semantic_mapper.files import atomic_write
-from semantic_mapper.geometry import turn_onto
+from semantic_mapper.geometry import invert_pose, transform, turn_onto
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.types import Float64, UInt8
+from semantic_mapper.types import Float64, Int64, UInt8
 
 FLOOR = "floor"  # the class whose points say where down is
 LEAST_SHARE = 0.01  # of a map's points that have to be floor
@@ -33,6 +34,10 @@ LEVEL_SHARE = 0.8  # of the floor's points on several storeys, each within so mu
 STOREY_M = 1.8  # storeys are at least so far apart
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in ROS's OccupancyGrid
+INFLATED = 99  # nearer to something occupied than the robot's radius, as nav2 publishes its costmaps
+Band = tuple[float, float]
+HEIGHT_M: Band = (0.1, 1.8)  # what a robot of a person's height can hit; what is lower, it rolls over
+RESOLUTION_M = 0.05
 LAYER_M = 0.04  # thickness of the layers among which the floor is looked for
 FLOOR_SHARE = 0.25  # of the fullest layer: the lowest one with this many points is the floor
 MAX_CELLS = 100_000_000
@@ -93,8 +98,8 @@ def _normal(xyz: Float64) -> Float64:
 class OccupancyGrid:
     """A floor plan in the grid's frame: z up, the floor at z = 0, x and y those of a world that has z up."""
 
-    # (H, W) int8, ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row j, column i is the square from ``origin_m + (i, j) *
-    # resolution_m`` on: rows run along +y
+    # (H, W) int8: 0 free, 100 occupied, -1 unknown; in a costmap also 99, inflated: so near to a cell of 100 that the
+    # robot hits it. Row j, column i is the square from ``origin_m + (i, j) * resolution_m`` on: rows run along +y
     cells: NDArray[np.int8]
     resolution_m: float  # side of a cell
     origin_m: tuple[float, float]  # (x, y) of the outer corner of cell (0, 0)
@@ -102,30 +107,57 @@ class OccupancyGrid:
     # (H, W) int8, 0 to 100 or ``UNKNOWN``, by class; None where no costs were given
     costs: NDArray[np.int8] | None = None
 
+    def at(self, points: ArrayLike) -> NDArray[np.int8]:
+        """Values (N,) of the cells above or below points (N, 3) or (3,), world metres; -1 beyond the grid."""
+        row, column = np.clip(self.cells_of(points) + 1, 0, np.array(self.cells.shape) + 1).T
+        return np.pad(self.cells, 1, constant_values=UNKNOWN)[row, column]
+
+    def cells_of(self, points: ArrayLike) -> Int64:
+        """Row and column (N, 2) of the cells above or below points (N, 3) or (3,), world metres, wherever they are."""
+        xy = transform(self.T_grid_world, np.atleast_2d(np.asarray(points, np.float64)))[:, :2]
+        return np.floor((xy - self.origin_m) / self.resolution_m).astype(np.int64)[:, ::-1]
+
+    def centres_of(self, cells: ArrayLike) -> Float64:
+        """Centres (N, 3) of cells, row and column (N, 2), on the floor, world metres."""
+        xy = (np.asarray(cells, np.float64)[:, ::-1] + 0.5) * self.resolution_m + self.origin_m
+        return transform(invert_pose(self.T_grid_world), np.column_stack((xy, np.zeros(len(xy)))))
+
+    def inflated(self, radius_m: float) -> OccupancyGrid:
+        """With 99 where an occupied cell is at most ``radius_m`` away, centre to centre. ``MapError``: a bad radius."""
+        if not 0 <= radius_m < np.inf:
+            raise MapError(f"radius_m must be 0 or more, got {radius_m}")
+        occupied = self.cells == OCCUPIED
+        distance = cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)  # in cells
+        near = ~occupied & (distance * self.resolution_m <= radius_m + 1e-6)
+        return replace(self, cells=np.where(near, np.int8(INFLATED), self.cells))
+
 
 def occupancy_grid(
     points: MapPoints,
     up: Float64,
-    resolution_m: float,
-    height_m: tuple[float, float],
+    voxel_size_m: float,
+    height_m: Band | None = None,
     floor_m: float | None = None,
     cost_of: NDArray[np.int64] | None = None,
+    resolution_m: float | None = None,
 ) -> OccupancyGrid:
     """Make the plan of a map's surface points; see the head of this file for what its values mean. ``MapError``:
     impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
 
     Args:
         up: (3,) unit vector, up in the world.
-        resolution_m: Side of a cell; below the map's voxel size, walls would have holes.
-        height_m: LOW and HIGH above the floor, 0 < LOW < HIGH.
+        voxel_size_m: Of the map.
+        height_m: LOW and HIGH above the floor, 0 < LOW < HIGH; None = ``HEIGHT_M``.
         floor_m: Height of the floor, along ``up`` from the origin of the world; None = found by ``floor_height``.
         cost_of: (256,) cost of each class id, 0 to 100, -1 = none of its own; None makes no ``costs``. A cell costs as
-            much as the dearest surface in it; surface without a cost of its own 100 above LOW, and nothing as floor."""
-    low, high = height_m
+            much as the dearest surface in it; surface without a cost of its own 100 above LOW, and nothing as floor.
+        resolution_m: Side of a cell; None = 5 cm, or a larger voxel."""
+    low, high = height_m or HEIGHT_M
     if not (0 < low < high and np.isfinite(high)):
         raise MapError(f"height band {low:g} to {high:g} m: LOW must be above 0 and below HIGH")
-    if not (resolution_m > 0 and np.isfinite(resolution_m)):
-        raise MapError(f"resolution must be above 0, got {resolution_m} m")
+    resolution_m = max(RESOLUTION_M, voxel_size_m) if resolution_m is None else resolution_m
+    if not voxel_size_m <= resolution_m < np.inf:
+        raise MapError(f"resolution {resolution_m} m: cells smaller than voxels ({voxel_size_m:g} m) leave holes")
     T_grid_world = np.eye(4)
     T_grid_world[:3, :3] = turn_onto(up, np.array((0.0, 0.0, 1.0)))
     xyz = points.xyz.astype(np.float64) @ T_grid_world[:3, :3].T

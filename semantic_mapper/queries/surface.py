@@ -15,13 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.floor_plan import Band, OccupancyGrid, find_up, occupancy_grid
+from semantic_mapper.mapping.map_types import MapPoints, require_metres
 from semantic_mapper.queries.checks import (
     as_numbers,
     check_box,
     check_directions,
     check_points,
     check_positive,
+    check_up,
     rows_in_box,
 )
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
@@ -70,6 +72,25 @@ def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> 
     surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
     inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
     return surface_points(snapshot, SurfaceVoxels(surface.row[inside], surface.voxel[inside], surface.point[inside]))
+
+
+def costmap(
+    snapshot: MapSnapshot,
+    radius_m: float,
+    *,
+    up: ArrayLike | None = None,
+    height_m: Band | None = None,
+    floor_m: float | None = None,
+) -> OccupancyGrid:
+    """Where the middle of a round robot of ``radius_m`` can be: the floor plan, inflated, without what moves.
+
+    ``height_m``: LOW and HIGH above the floor, between which the robot hits surface, by default 0.1 and 1.8. ``up``,
+    (3,) in the world, and ``floor_m``, the floor's height along it, are found by default. ``MapError``: a bad number;
+    no metres; no floor, or nothing near it."""
+    require_metres(snapshot.scale_known, "costmap")
+    points = surface_points(snapshot, surface_voxels(snapshot))
+    axis = find_up(points, snapshot.label_set) if up is None else check_up(up)
+    return occupancy_grid(points, axis, snapshot.voxel_size_m, height_m, floor_m).inflated(radius_m)
 
 
 @kernel

@@ -141,11 +141,12 @@ def test_impossible_plans_are_refused(room: MapPoints) -> None:
     for height in ((0.0, 1.0), (0.5, 0.4), (0.1, np.inf)):
         with pytest.raises(MapError, match="height band"):
             occupancy_grid(room, UP, 0.05, height)
-    with pytest.raises(MapError, match="resolution"):
-        occupancy_grid(room, UP, 0.0, HEIGHT)
+    for resolution in (0.0, 0.04, np.nan, np.inf):
+        with pytest.raises(MapError, match="resolution"):
+            occupancy_grid(room, UP, 0.05, HEIGHT, resolution_m=resolution)
     with pytest.raises(MapError, match="no surface between"):
         occupancy_grid(room, UP, 0.05, HEIGHT, floor_m=20.0)
     with pytest.raises(MapError, match="larger cells"):
-        occupancy_grid(room, UP, 1e-4, HEIGHT)
+        occupancy_grid(room, UP, 1e-5, HEIGHT, resolution_m=1e-4)
     with pytest.raises(MapError, match="without surface"):
         occupancy_grid(MapPoints(*(getattr(room, n)[:0] for n in MapPoints.__slots__)), UP, 0.05, HEIGHT)

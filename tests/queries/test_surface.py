@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import points_in_box, surface_voxels
+from semantic_mapper.queries.surface import costmap, points_in_box, surface_voxels
 from tests.queries.random_map import random_map, voxel_places
-from tests.queries.scene import CUP, FLOOR, TABLE, surface_of, truth_distance, whole
+from tests.queries.scene import BALL, BOX, CUP, FLOOR, TABLE, surface_of, truth_distance, whole
 
 
 def dense(snapshot: MapSnapshot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -76,3 +78,19 @@ def test_points_are_all_surface_points_in_the_box() -> None:
     np.testing.assert_allclose(found.confidence, confidence[inside] / 255, atol=1e-6)
     assert found.xyz.dtype == found.confidence.dtype == np.float32 and found.rgb.shape == found.xyz.shape
     assert len(points_in_box(whole(), (5, 5, 5), (6, 6, 6)).xyz) == 0
+
+
+def test_a_costmap_is_the_floor_plan_without_what_is_within_the_radius_of_something() -> None:
+    plain, costs = costmap(whole(), 0.0, up=(0, 0, 2)), costmap(whole(), 0.2)
+    beside = BOX + np.array((0.0, 0.45, 0.0))
+    assert plain.at((BOX, BALL, beside, (9, 9, 0))).tolist() == [100, 100, 0, -1]
+    assert costs.at((BOX, BALL, beside, (-9, 0, 0))).tolist() == [100, 100, 99, -1] and costs.at(BOX) == [100]
+    cells, occupied = np.argwhere(plain.cells == plain.cells), np.argwhere(plain.cells == 100)
+    near = scipy.spatial.KDTree(occupied).query(cells)[0].reshape(plain.cells.shape) * plain.resolution_m <= 0.2 + 1e-9
+    np.testing.assert_array_equal(costs.cells, np.where(near & (plain.cells != 100), 99, plain.cells))
+    assert {*np.unique(costs.cells).tolist()} == {-1, 0, 99, 100}
+    np.testing.assert_array_equal(costs.cells_of(costs.centres_of(cells)), cells)
+    assert (costmap(whole(), 0.2, height_m=(0.5, 1.0)).at((BOX, BALL)) < 99).all(), "a robot that is higher than both"
+    for wrong, said in (({"radius_m": -1.0}, "radius"), ({"radius_m": np.nan}, "radius"), ({"up": (0, 0, 0)}, "up")):
+        with pytest.raises(MapError, match=said):
+            costmap(whole(), **{"radius_m": 0.2, **wrong})
