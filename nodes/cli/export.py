@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 
 import typer
 
+from semantic_mapper.client import MapClient
 from semantic_mapper.config import Fraction, NotNegative
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.verb import JsonOutput, UpOption, verb, wrong_usage
+from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, UpOption, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
 from semantic_mapper.nodes.fleet.store import is_url
@@ -27,6 +28,7 @@ from semantic_mapper.replay.exporters.map_files import (
 from semantic_mapper.replay.exporters.run import LogFormat
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_log, map_path, prepare_file, prepare_folder, refuse_overwriting
+from semantic_mapper.transport.launches import is_running_mapper
 
 Pair = tuple[float, float]
 
@@ -34,8 +36,9 @@ Pair = tuple[float, float]
 @verb
 def export(
     output: Output,
-    # saved map, log, or a folder with one
-    source: Annotated[Path, typer.Argument(metavar="MAP|LOG")],
+    # saved map, log, folder with one, or running mapper: `live`, launch, ipc://PATH, tcp://HOST:PORT
+    source: Annotated[str, typer.Argument(metavar="MAP|LOG")],
+    remote: Remote,
     *,
     out: Path,  # file to write; its ending says the format
     # where the ending does not say it
@@ -52,34 +55,46 @@ def export(
     camera: str = "",  # logs: the frames of this camera only
     max_frames: NotNegative = 0,  # logs: stop after this many; 0 = all
 ) -> None:
-    """Write a saved map, or a log, in a format of other programs.
+    """Write a map, or a log, in a format of other programs.
 
     Maps: .ply points (--format ply-mesh: a mesh), .glb mesh, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for
     nav2: a cell is free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown
     255).
+
+    Of a running mapper the map as it is now, unlike the file that it saves: only the likeliest class of a voxel, and
+    for --min-weight only whether depth was computed (below 1) or measured (1).
 
     Logs: .mcap for Foxglove, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
     --format tum a TUM RGB-D sequence.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
     Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2 --costs costs.toml
+    Example: semantic-mapper export live --out now.ply
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     map_options = (color, height, resolution, floor, costs, up, min_weight, min_confidence)
-    if is_log(source):
+    path, live = Path(source), is_running_mapper(source)
+    if not live and is_log(path):
         if map_options != (None, None, None, None, None, "auto", SURFACE_WEIGHT, 0.0):
             raise ConfigError(f"{source}: is a log; only --format, --camera and --max-frames are for logs")
-        export_recording(output, source, out, log_format_of(out, format_), camera, max_frames)
+        export_recording(output, path, out, log_format_of(out, format_), camera, max_frames)
         return
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
     of_grid = (height, resolution, floor, costs)
     with wrong_usage():
         request = ExportRequest(format_of(out, format_), min_weight, min_confidence, color, parse_up(up), *of_grid)
-    path = map_path(source)
-    refuse_overwriting(out, path)
+    if not live:
+        path = map_path(path)
+        refuse_overwriting(out, path)
     prepare_file(out)
-    report = export_map(VoxelMap.load(path), out, request)
+    if live:
+        with MapClient(source, server=remote.server, keys=remote.keys) as client:
+            seen = client.mirror().snapshot()
+        world_map = VoxelMap.received(seen.changes(0), seen.voxel_size_m, seen.label_set)
+    else:
+        world_map = VoxelMap.load(path)
+    report = export_map(world_map, out, request)
     output.print(f"{' and '.join(map(str, report.files))}: {report.content}")
     for line in report.found:
         output.print(f"  {line}")

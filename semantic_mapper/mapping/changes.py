@@ -16,7 +16,8 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
-from semantic_mapper.mapping.blocks import BLOCK_VOXELS, PackedBlocks
+from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockValues, PackedBlocks
+from semantic_mapper.mapping.fusion import MEASURED, SURFACE_WEIGHT
 from semantic_mapper.types import Bool, Int32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
@@ -135,6 +136,24 @@ def oldest_first(versions: Int64, since: int, limit: int, newest: int) -> tuple[
     distinct, counts = np.unique(versions, return_counts=True)
     version = int(distinct[np.searchsorted(np.cumsum(counts), limit)])
     return np.flatnonzero(versions <= version), version
+
+
+def received_parts(changes: BlockChanges, label_set: LabelSet) -> Iterator[tuple[Int32, BlockValues]]:
+    """Keys and voxels of blocks that read as ``changes`` do; see ``VoxelMap.received``."""
+    for start in range(0, len(changes.keys), _READ_AT_ONCE):
+        part = slice(start, start + _READ_AT_ONCE)
+        label, confidence, observed = changes.label[part], changes.confidence[part], changes.observed[part]
+        computed = 0 if changes.computed is None else changes.computed[part]
+        weight = np.where(observed, np.where(computed, SURFACE_WEIGHT, MEASURED), 0).astype(np.float32)
+        tsdf = np.where(observed, changes.tsdf[part] / np.float32(TSDF_STEPS), np.float32(0))
+        evidence = np.zeros((*label.shape, len(label_set)), np.float32)
+        known = label != label_set.ignore_id
+        # The softmax of e for one of L classes, and 0 for the others, is p: e = log(p / (1 - p) * (L - 1)).
+        p = np.clip(confidence[known], 0.5, CONFIDENCE_STEPS - 0.5) / CONFIDENCE_STEPS
+        odds = p / (1 - p) * max(1, len(label_set) - 1)
+        evidence[(*np.nonzero(known), label_set.to_channels(label[known]))] = np.log(np.maximum(odds, 1.001))
+        color, votes = changes.rgb[part].astype(np.float32), known.astype(np.float32)
+        yield changes.keys[part], BlockValues(tsdf, weight, color, evidence, votes)
 
 
 # Serial: it runs next to the mapper, which needs the other threads.

@@ -22,6 +22,7 @@ from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, mak
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.blocks import pack_keys, unpack_keys
 from semantic_mapper.mapping.changes import (
+    CONFIDENCE_STEPS,
     NONE_CLEARED,
     BlockChanges,
     ClearedBlocks,
@@ -30,6 +31,7 @@ from semantic_mapper.mapping.changes import (
     empty_changes,
     oldest_first,
     packed_parts,
+    received_parts,
 )
 from semantic_mapper.mapping.clearing import NO_BOUNDS, Scene, clear_in_view, depth_bounds
 from semantic_mapper.mapping.fusion import (
@@ -294,6 +296,18 @@ class VoxelMap:
         """Another map, as one was when the snapshot was made, bit for bit."""
         made = cls(snapshot.manifest.config, snapshot.manifest.label_set)
         made._begin_with(snapshot.manifest, snapshot.parts(), snapshot.places)
+        return made
+
+    @classmethod
+    def received(cls, changes: BlockChanges, voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+        """What changes since version 0 hold of a map, to be exported, not continued: a voxel has a vote for its class,
+        if one is sure, and weight 1, or ``SURFACE_WEIGHT`` of computed depth; ``frames`` is the version."""
+        least = int(changes.confidence[changes.label != label_set.ignore_id].min(initial=CONFIDENCE_STEPS))
+        below = max(0.0, least - 0.5) / CONFIDENCE_STEPS  # the map's own is not sent; no class here is less sure
+        config = VoxelMapConfig(voxel_size_m=voxel_size_m, max_blocks=max(1, len(changes.keys)), unknown_below=below)
+        made, scale = cls(config, label_set), scale_name(changes.scale_known)
+        saved = MapManifest(config=config, label_set=label_set, frames=changes.version, last_stamp_ns=0, scale=scale)
+        made._begin_with(saved, received_parts(changes, label_set), ())
         return made
 
     @classmethod

@@ -86,7 +86,7 @@ def launch_folder(place: str) -> Path:
         return meant[0]
     if meant:
         raise TransportError(f"several launches run here; name one by its file or folder: {_listed(meant)}")
-    if place and Path(place).exists():
+    if place not in ("", LIVE) and Path(place).exists():
         raise TransportError(f"{place}: no socket folder of a launch that runs; `up` names its own as it starts")
     if running:
         raise TransportError(f"{place}: no launch that runs here; there are: {_listed(running)}")

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy
 
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
@@ -59,3 +60,17 @@ def test_things_have_the_fraction_that_was_measured(snapshot) -> None:
     fraction = {thing.class_name: thing.measured for thing in InstanceTracker().update(snapshot)}
     assert fraction["cup"] > 0.9 and fraction["table"] < 0.1
     assert all(thing.measured == 1 for thing in InstanceTracker().update(whole()))
+
+
+def test_a_map_made_of_what_was_received_gives_out_the_same() -> None:
+    sent = part_measured().changes(0)
+    made = VoxelMap.received(sent, 0.02, LABELS)
+    again, known = made.changes(0), sent.label != LABELS.ignore_id
+    for name in ("keys", "tsdf", "label", "rgb", "computed", "version"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(sent, name), name)
+    np.testing.assert_array_equal(again.confidence[known], sent.confidence[known])
+    points, expected = made.points(), part_measured().points()
+    distance, at_row = scipy.spatial.KDTree(expected.xyz).query(points.xyz)
+    assert abs(len(distance) - len(expected.xyz)) < 10 and np.quantile(distance, 0.99) < 0.01
+    assert expected.measured is not None and (points.measured == expected.measured[at_row]).mean() > 0.999
+    assert (points.label == expected.label[at_row]).mean() > 0.99

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_voxel_map import fuse_sphere
-from tests.nodes.support import refused
+from tests.nodes.mapper.test_query_service import a_folder, answering
+from tests.nodes.support import refused, run_ok
+from tests.queries.scene import whole_map
 
 
 @pytest.fixture(scope="module")
@@ -30,3 +33,16 @@ def test_what_cannot_be_exported_or_merged_is_refused_and_leaves_nothing(results
     ):
         assert said in refused(*words)
     assert VoxelMap.load(results / "map.npz").frames == 3 and not list(tmp_path.iterdir())
+
+
+def test_the_map_of_a_running_mapper_is_written_as_its_file_is(tmp_path: Path) -> None:
+    whole_map().save(tmp_path / "map.npz")
+    with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        for source, name in ((service.endpoint, "live"), (tmp_path, "saved")):
+            run_ok("export", source, "--out", tmp_path / f"{name}.npz")
+            assert "cells of 0.05 m" in run_ok("export", source, "--out", tmp_path / f"{name}.yaml").stdout
+    live, saved = (np.load(tmp_path / f"{name}.npz") for name in ("live", "saved"))
+    assert abs(len(live["xyz"]) - len(saved["xyz"])) < 10
+    ids, counts = np.unique(saved["label"], return_counts=True)
+    assert [(live["label"] == i).sum() for i in ids] == pytest.approx(counts, abs=20)
+    assert (tmp_path / "live.pgm").read_bytes() == (tmp_path / "saved.pgm").read_bytes()
