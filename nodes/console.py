@@ -159,6 +159,12 @@ class FrameProgress(JobMonitor):
         if stage and not self._progress.console.is_terminal:
             _log.info(stage, total=total)
 
+    def report(self, stage: str, done: int, total: int) -> None:
+        """So many of a stage, or of all (""), are done; a new stage begins a new bar."""
+        if (stage, total) != (self._stage, self._total):
+            self.start(total, stage)
+        self.set(done)
+
     def advance(self, count: int = 1) -> None:
         """This many more are done."""
         self.set(self._done + count)

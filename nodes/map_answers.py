@@ -69,11 +69,11 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
 
 
 UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
-NO_FLOOR = "no floor was found: too little level surface, or another way is up (--up)"
+NO_FLOOR = "no floor was found: too little level surface, or another direction is up (--up)"
 
 
 def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict[str, Any]:
-    """The things in a map, the surest first.
+    """The things in a map, the most certain first.
 
     Those that have gone are ``gone``, the latest first; the key is left out while nothing has gone.
     """

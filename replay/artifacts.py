@@ -203,6 +203,7 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
         "depth": _depth_source(session),
         "scale": scale_name(voxel_map.scale_known),
+        "scale_from": (voxel_map.scale_known and session.scale_from) or None,
         "pose_check": {
             "keyframes_compared": poses.compared,
             "depth_disagreement": _rounded(poses.recent, 4),

@@ -34,6 +34,7 @@ from semantic_mapper.replay.run_folder import hold_folder, prepare_file
 from semantic_mapper.replay.session import MapSession, open_recording
 from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.scale import fit_to_scene
+from semantic_mapper.transport.messages import SCALE_KEY
 from semantic_mapper.types import PosedFrame
 
 if TYPE_CHECKING:
@@ -82,14 +83,15 @@ def replay_log(
         config = config if trajectory is None else keeping_frames(config, len(source))
         mapper = Mapper.load(weights, config)
         clear_results(out)
+        mapper.voxel_map.note_scale(source.info.scale_known)
         session = MapSession(
             mapper,
             stream_labels=source.info.label_set,
             source=source.info.source,
-            scale_known=source.info.scale_known,
             rerun=open_recording(rerun, mapper.pipeline) if watch is None else watch(mapper.pipeline),
         )
         session.left_out = read_left_out(source.attachments())
+        session.scale_from = source.info.metadata.get(SCALE_KEY, "")
         for error in source.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
         total = min(len(source), max_frames or len(source))

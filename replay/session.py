@@ -109,13 +109,11 @@ class MapSession:
         *,
         stream_labels: LabelSet | None,
         source: str = "",
-        scale_known: bool = True,
         rerun: RerunLog | None = None,
         own_first: bool = True,
     ) -> None:
         self.mapper = mapper
         self.pipeline = mapper.pipeline
-        self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
         self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
         self.exclude_stamps = mapper.checkpoint.train_stamps_ns
@@ -127,6 +125,7 @@ class MapSession:
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.left_out = 0  # by the import that has made the log
+        self.scale_from = ""  # what the metres of the stream come from, where poses are of pictures
         self.without_depth = 0  # their geometry was rendered, not measured
         self.outside = 0  # that weights of one scene know less than half of
         self._known, self._mapped = 0.0, 0  # fractions of frames that they know, in sum; frames
@@ -149,7 +148,7 @@ class MapSession:
         self._snapshot_stride = 1
         self.rerun = rerun
         if rerun is not None:
-            rerun.note_scale(scale_known)
+            rerun.note_scale(self.pipeline.voxel_map.scale_known)
 
     def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
         """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones, or its world

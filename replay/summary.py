@@ -104,6 +104,11 @@ def result_lines(out: Path) -> list[str]:
     return [f"  {out / name}  ({text})" for name, text in _RESULTS.items() if (out / name).exists()]
 
 
+def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
+    """What became of a run, what to know of it, and its files, a line each."""
+    return [*headlines(summary), *notes(summary), *result_lines(out)]
+
+
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
     frames, warnings = summary["frames"], [dig(summary, place) for place in _WARNINGS]
@@ -120,6 +125,8 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         )
     if summary.get("scale") == "unknown":
         lines.append(f"scale: unknown; lengths of this map are not metres, what needs metres is refused: {SCALE_FIX}")
+    elif scale := summary.get("scale_from"):
+        lines.append(f"scale: from {scale}; an error there scales the whole map")
     reason = f"refused; the first: {summary['refusals'][0]['reason'] if summary.get('refusals') else ''}"
     for name, text in {**_FRAME_NOTES, "refused": reason}.items():
         if frames.get(name):

@@ -40,7 +40,7 @@ class LogError(SemanticMapperError):
 
 
 class EmptyMapError(LogError):
-    """No frame of a recording could be mapped."""
+    """A recording has no frame that can be mapped."""
 
 
 class ImportSourceError(SemanticMapperError):

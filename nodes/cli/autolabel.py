@@ -37,7 +37,7 @@ def autolabel(
     `eval` and `map` never score on them, and computed depth counts as in `map`. Labels that are there stay; those
     of an earlier autolabel are replaced. Ctrl-C leaves nothing (exit code 130).
 
-    Example: semantic-mapper autolabel kitchen.mcap --weights kitchen.safetensors --out labelled.mcap
+    Example: semantic-mapper autolabel a.mcap --weights a.safetensors --out b.mcap
     """
     must_be_there(*log)
     from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log

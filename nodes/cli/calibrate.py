@@ -45,8 +45,8 @@ def calibrate(
     refused, with what is missing. Drivers take NAME.toml as `calibration`.
 
     Example: semantic-mapper calibrate --board board.png
-    Example: semantic-mapper calibrate v4l2:/dev/video0 --size 1280x720 --square-mm 39.6 --out calibration
-    Example: semantic-mapper calibrate --stereo v4l2:/dev/video0 --size 2560x720 --square-mm 39.6
+    Example: semantic-mapper calibrate v4l2:/dev/video0 --square-mm 39.6
+    Example: semantic-mapper calibrate --stereo v4l2:/dev/video0 --size 2560x720
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
     with wrong_usage():

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from semantic_mapper.nodes.cli.mapping import show_result
 from semantic_mapper.nodes.cli.up import run_launch
 from semantic_mapper.nodes.cli.verb import MapperSettings, WeightsOption, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
@@ -21,6 +20,7 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import end_process
 from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.run_folder import prepare_folder
+from semantic_mapper.replay.summary import ending
 from semantic_mapper.transport.launches import LIVE, running_launches
 
 LAUNCH = Path("camera")  # that of the package
@@ -61,10 +61,13 @@ def demo(
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:
             summary, _ = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar)
-        show_result(output, summary, out)
+        for line in ending(summary, out):
+            output.print(line)
         output.print(f"  {demo_log()}  (the log it was made from)")
         ended = "stopped after" if stop else "done in"
-        stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
+        stderr_console().print(
+            f"{ended} {time.monotonic() - began:.0f} s; next: `semantic-mapper query {out} nearest chair 0 0 1`"
+        )
         return stop.exit_code
 
 

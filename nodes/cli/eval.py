@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,11 +20,11 @@ from semantic_mapper.nodes.cli.verb import (
     results_file,
     verb,
 )
-from semantic_mapper.nodes.console import Output, frame_progress
+from semantic_mapper.nodes.console import frame_progress
 from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.run_folder import MAP_SUFFIX, is_log, prepare_file
-from semantic_mapper.replay.summary import notes, percent, read_summary, result_lines, summary_table
+from semantic_mapper.replay.summary import notes, percent, read_summary, summary_table
 
 
 @verb
@@ -51,7 +50,7 @@ def evaluate(
     it.
 
     Example: semantic-mapper eval runs/a runs/b
-    Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
+    Example: semantic-mapper eval a.mcap --weights a.safetensors --baselines
     Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
     out = results_file(out)
@@ -68,7 +67,12 @@ def evaluate(
     )
     path = out or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     prepare_file(path)
-    found: dict[str, Any] = {"replays": print_results(output, folders), "logs": {}}
+    summaries = {str(folder): read_summary(folder) for folder in folders}
+    if summaries:
+        output.print(summary_table(summaries))
+    for name, summary in summaries.items():
+        output.lines([f"{name}: {note}" for note in notes(summary)])
+    found: dict[str, Any] = {"replays": summaries, "logs": {}}
     if mesh is not None:
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
@@ -88,19 +92,6 @@ def evaluate(
     write_eval_report(page := path.with_suffix(".html"), found, folders)
     output.print(f"written to {path} and, for a browser, {page}")
     output.json(found)
-
-
-def print_results(output: Output, folders: Sequence[Path]) -> dict[str, dict[str, Any]]:
-    """Show the tables of result folders side by side, and where the files are."""
-    short = [f.resolve().name for f in folders]
-    names = [s if short.count(s) == 1 else str(f) for s, f in zip(short, folders, strict=True)]
-    summaries = dict(zip(names, map(read_summary, folders), strict=True))
-    if summaries:
-        output.print(summary_table(summaries))
-    for (name, summary), folder in zip(summaries.items(), folders, strict=True):
-        for line in (*(f"{name}: {n}" for n in notes(summary)), *result_lines(folder)):
-            output.print(line)
-    return summaries
 
 
 def _surface_line(figures: dict[str, Any]) -> str:

@@ -68,7 +68,7 @@ def export(
     --format tum a TUM RGB-D sequence.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
-    Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2 --costs costs.toml
+    Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2
     Example: semantic-mapper export live --out now.ply
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """

@@ -49,9 +49,9 @@ def finetune(
     The keyframes are those that together show most of the log; no other label is trained on, and `map` and `eval`
     never score on them. Ctrl-C writes the best weights so far (exit code 130). See docs/scenes.md.
 
-    Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
-    Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors
-    Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
+    Example: semantic-mapper finetune a.mcap --keyframes 8 --out a.safetensors
+    Example: semantic-mapper finetune a.mcap --labels a-labels --out a.safetensors
+    Example: semantic-mapper finetune a.mcap --kind grid --out a.safetensors
     """
     without_labels = kind in ("grid", "panoptic")
     refuse_options(

@@ -77,8 +77,8 @@ def run(
     exit code is 1 where logs failed. Ctrl-C ends the tasks that run (exit code 130).
 
     Example: semantic-mapper fleet run map "logs/*.mcap" --out runs/fleet
-    Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week --address head:6379
-    Example: semantic-mapper fleet run map "logs/*.mcap" --out runs/fleet --set voxel_map.voxel_size_m=0.05
+    Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week
+    Example: semantic-mapper fleet run map logs --out runs/a --set quality=fast
     """
     inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
     from semantic_mapper.nodes.fleet.run import OPERATIONS, make_task, run_fleet
@@ -130,7 +130,7 @@ def table(
 
     Example: semantic-mapper fleet table runs/fleet
     Example: semantic-mapper fleet table runs/fleet "log, miou" --csv miou.csv
-    Example: semantic-mapper fleet table runs/fleet "SELECT log, miou FROM logs WHERE tag_robot = 'r2' ORDER BY miou"
+    Example: semantic-mapper fleet table runs/fleet "SELECT * FROM failures"
     """
     tables = Tables(Store(store))
     rows = tables.overview() if query is None else tables.query(query)
@@ -170,14 +170,14 @@ def compare(
 ) -> int:
     """Say which logs of a fleet got better or worse, beyond noise: a gate for releases.
 
-    The latest results of each log are paired by its content. B is worse where the mean over logs has surely fallen
-    below that of A, where single logs have surely lost more than --log-threshold, or where logs with a result in A
+    The latest results of each log are paired by its content. B is worse where the mean over logs is
+    significantly worse, where single logs are worse by more than --log-threshold, or where logs with a result in A
     failed in B, are missing there or have no score. Exit codes: 0 not worse, 1 worse, 2 wrong usage, or something that
     cannot be read.
 
     Example: semantic-mapper fleet compare runs/released runs/candidate
-    Example: semantic-mapper fleet compare runs/released runs/candidate --metric iou:person --log-threshold 0.05 --json
-    Example: semantic-mapper fleet compare runs/released runs/candidate --metric step_ms_p50 --threshold 5
+    Example: semantic-mapper fleet compare runs/a runs/b --metric iou:person
+    Example: semantic-mapper fleet compare runs/a runs/b --metric step_ms_p50
     """
     limits = {"threshold": threshold, "log_threshold": log_threshold, "lower_is_better": lower_is_better}
     try:

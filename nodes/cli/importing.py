@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,16 +23,8 @@ from semantic_mapper.replay.importers.run import FORMATS, import_recording, is_r
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
-from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
+from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film
 from semantic_mapper.replay.sfm.scale import ScaleHint
-
-_STAGES = {
-    "look": "look through the film",
-    "features": "find features",
-    "match": "match frames",
-    "map": "find poses",
-    "write": "write the log",
-}
 
 
 class SourceOptions(Options, frozen=True):
@@ -107,23 +99,21 @@ def import_(
     Of a damaged log every intact message is kept. See docs/layouts.md.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
-    Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
+    Example: semantic-mapper import film.mp4 film.mcap --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
     if format_ not in (None, *FORMATS):
         raise typer.BadParameter(f"'{format_}' is not valid{nearest(format_, list(FORMATS))}", param_hint="--format")
+    renames = load_config(rename, RenameConfig).classes if rename is not None else {}
+    reading = ImportOptions(every, max_frames or None, megapixels=megapixels, renames=renames)
     if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
+        if options.given or reading != ImportOptions():
+            raise typer.BadParameter("a log is copied as it is; leave out all options", param_hint="SRC")
         _recover(output, source, log)
         return
-    renames = load_config(rename, RenameConfig).classes if rename is not None else {}
     log.parent.mkdir(parents=True, exist_ok=True)
-    if (
-        format_ is None
-        and is_film(source)
-        and (rename is not None or max_frames or every > 1 or megapixels != MEGAPIXELS)
-    ):
+    if format_ is None and is_film(source) and reading != ImportOptions():
         raise typer.BadParameter("a film has no classes to rename, and all of it is read, in a size of its own")
-    reading = ImportOptions(every, max_frames or None, megapixels=megapixels, renames=renames)
     import_source(output, source, log, options, format_, reading, overwrite=overwrite)
 
 
@@ -151,13 +141,8 @@ def import_source(
         return 0
     reading = options.reading(reading or ImportOptions())
     with frame_progress("import", None) as bar:
-
-        def on_progress(done: int, total: int) -> None:
-            if done == 1:
-                bar.start(total)
-            bar.set(done)
-
-        report = import_recording(source, log, format_name, on_progress, options=reading, overwrite=overwrite)
+        show = partial(bar.report, "")
+        report = import_recording(source, log, format_name, show, options=reading, overwrite=overwrite)
     _print_import(output, report, log)
     return report.with_depth
 
@@ -202,44 +187,30 @@ def _recover(output: Output, source: Path, log: Path) -> None:
     )
     if not report.finished:
         output.print("  the old log had not been closed by its writer")
-    output.lines([f"  lost: {error}" for error in report.lost])
+    output.lines([f"  not saved: {error}" for error in report.lost])
 
 
 def _import_film(output: Output, source: Path, log: Path, options: FilmOptions, *, overwrite: bool) -> None:
     """Import a film with progress, and say what became of it."""
     with frame_progress("import", None) as bar:
-        stage = ""
-
-        def show(what: str, done: int, total: int) -> None:
-            nonlocal stage
-            if what != stage:
-                bar.start(total, _STAGES.get(what, what))
-                stage = what
-            bar.set(done)
-
-        report = import_film(source, log, options, show, overwrite=overwrite)
-    frames, megabytes = len(report.T_world_camera), log.stat().st_size / 1e6
-    output.print(f"{log}: {counted(frames, 'frame')} of {report.note.frames}, {megabytes:.1f} MB, from a film")
-    for name, value in film_figures(report).items():
-        output.print(f"  {name}: {value}")
-    for notice in report.notices:
-        output.print(f"  note: {notice}")
-    output.lines([f"  left out: {stretch}" for stretch in report.left_out])
-
-
-def film_figures(report: FilmReport) -> Mapping[str, str]:
-    """What became of a film, for people, by name."""
-    unit, note = length_unit(bool(report.scale)), report.note
-    found = {
+        report = import_film(source, log, options, bar.report, overwrite=overwrite)
+    pictures = source.is_dir() and pictures_of(source)[0].parent  # perhaps of a folder in it
+    unit, note, megabytes = length_unit(bool(report.scale)), report.note, log.stat().st_size / 1e6
+    frames = f"{len(report.T_world_camera)} of {counted(note.frames, 'frame')}"
+    output.print(f"{log}: {frames}, {megabytes:.1f} MB, from {pictures or source}")
+    figures = {
         "scale": report.scale or "unknown: lengths are not metres",
         "registered": f"{note.registered} of {note.picked} frames that structure from motion was given",
-        "in the log": f"{len(report.T_world_camera)} of {note.frames} frames of the film",
         "left out": ", ".join(f"{count} {reason}" for reason, count in note.left_out.items()) or "none",
         "reprojection error": f"{note.error_px:.2f} px, mean over {report.points} points",
         "focal length": f"{note.focal_px:.1f} px of the film, {report.focal_source}",
         "distortion": ", ".join(f"{value:.4f}" for value in report.distortion) or "none",
-        "way": f"{report.path_m:.2f} {unit}",
+        "path length": f"{report.path_m:.2f} {unit}",
     }
     if report.height_m is not None:
-        found["camera over the floor"] = f"{report.height_m:.2f} {unit}"
-    return found
+        figures["camera over the floor"] = f"{report.height_m:.2f} {unit}"
+    for name, value in figures.items():
+        output.print(f"  {name}: {value}")
+    for notice in report.notices:
+        output.print(f"  note: {notice}")
+    output.lines([f"  left out: {stretch}" for stretch in report.left_out])

@@ -28,7 +28,7 @@ def keys(
     forget: let a machine in no more; connections that it has end when it next connects.
 
     Example: semantic-mapper keys make
-    Example: semantic-mapper keys allow workstation 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'
+    Example: semantic-mapper keys allow robot 'KEY, AS THE ROBOT SHOWS IT'
     """
     if bool(name) != (action in ("allow", "forget")) or bool(key) != (action == "allow"):
         raise typer.BadParameter("write make, show, allow NAME KEY, or forget NAME", param_hint="ACTION")

@@ -58,7 +58,7 @@ def label(
     weights came of it.
 
     Example: semantic-mapper label kitchen.mcap --suggest 8
-    Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels
+    Example: semantic-mapper label kitchen.mcap --serve --out kitchen-labels
     Example: semantic-mapper label kitchen.mcap --keyframes 12
     """
     send = suggest is None and not serve

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import typer
 
@@ -22,7 +21,7 @@ from semantic_mapper.nodes.cli.verb import (
     refuse_options,
     verb,
 )
-from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.console import frame_progress, stderr_console
 from semantic_mapper.nodes.local_server import open_browser
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer.server import ViewerPage
@@ -30,7 +29,7 @@ from semantic_mapper.replay.importers.base import ImportOptions
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.run import needs_import
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder
-from semantic_mapper.replay.summary import dig, headlines, notes, result_lines
+from semantic_mapper.replay.summary import dig, ending
 
 
 class HiddenSourceOptions(SourceOptions, frozen=True):
@@ -93,7 +92,8 @@ def map_(
         with frame_progress("map", None, stop=stop) as bar:
             more = {"rerun": rerun, "watch": page and page.watch, "corrections": corrections, "monitor": bar}
             summary, _ = replay_log(source, out, weights, config, max_frames, **more)
-        show_result(output, summary, out)
+        for line in ending(summary, out):
+            output.print(line)
         output.json(summary)
         if open_:
             open_browser((out / "report.html").resolve().as_uri())
@@ -107,9 +107,3 @@ def map_(
             stderr_console().print("the page stays until Ctrl-C")
             page.wait(stop)
         return code
-
-
-def show_result(output: Output, summary: Mapping[str, Any], out: Path) -> None:
-    """What became of one replay, notes and files, for people."""
-    for part in (*headlines(summary), *notes(summary), *result_lines(out)):
-        output.print(part)

@@ -66,7 +66,7 @@ def query(
     up: UpOption = "auto",
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least
     gone: bool = False,  # instances, running mapper: gone ones, too
-    unsure: bool = False,  # nearest, instances: pieces that are less likely things, too
+    unsure: bool = False,  # nearest, instances: also below the least certainty
     picture: Path | None = None,  # graph: also draw it from above (.png)
     camera: str = "",  # correct: the camera of the poses, of several
     every: AtLeastOne = 1,  # relocalize: every n-th frame
@@ -82,7 +82,7 @@ def query(
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
-    Example: semantic-mapper query runs/demo graph --picture rooms.png --out graph.json
+    Example: semantic-mapper query runs/demo graph --picture rooms.png
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     name, point = _read_arguments(question, arguments or [])
@@ -111,7 +111,7 @@ def query(
             found = {"map": source, **answer(world_map, *values)}
         output.print(answer_table(found))
         if found.get("found") is False and not unsure:
-            output.print("nothing is sure enough to be listed; --unsure also takes stray pieces")
+            output.print("nothing is certain enough to be listed; --unsure lists all candidates")
     if out is not None:
         write_json(out, found)
     output.json(found)

@@ -58,7 +58,7 @@ def record(
     where something is missing, as where the disk was full; what was written is whole. A launch can also have a
     recorder of its own (`up --set recorder.enabled=true`).
 
-    Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
+    Example: semantic-mapper record kitchen.mcap --on-disk-full delete-oldest
     """
     prepare_file(log)
     wanted = {"out": str(log), "source_timeout_s": HEAR_S, "overwrite": overwrite, **recorder.table()}
@@ -91,7 +91,7 @@ def _report(output: Output, log: Path, recorder: Recorder) -> int:
     parts = f" in {done.parts} parts" if done.parts > 1 else ""
     output.print(f"{log}: {counted(done.frames, 'frame')}, {counted(done.messages, 'message')}{parts}")
     if missed := recorder.missing_frames.missed:
-        output.print(f"  note: {counted(missed, 'frame')} never came: sent too early, or lost on the way")
+        output.print(f"  note: {counted(missed, 'frame')} never came: sent too early, or dropped in transport")
     if done.deleted:
         output.print(f"  note: {counted(done.deleted, 'part')} deleted to make room")
     if not recorder.losses:

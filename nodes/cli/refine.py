@@ -35,7 +35,7 @@ def refine(
     Writes a map like any other: query, export, merge it, or go on mapping into it. Geometry and colours are unchanged.
 
     Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz
-    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights smoothed
+    Example: semantic-mapper refine runs/a --out refined.npz --weights smoothed
     """
     if by_name and weights is None:
         raise typer.BadParameter("goes with --weights; without, other classes are smoothed", param_hint="--by-name")

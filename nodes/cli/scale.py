@@ -10,11 +10,11 @@ import typer
 
 from semantic_mapper.config import AtLeastZero
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.mapping import show_result
 from semantic_mapper.nodes.cli.verb import JsonOutput, WeightsOption, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.exporters.map_files import parse_numbers
+from semantic_mapper.replay.summary import ending
 from semantic_mapper.types import Float64
 
 
@@ -25,7 +25,7 @@ def scale(
     *,
     # two points of the map, x,y,z each, as `view` and `query` give them, and the metres between them
     known: Annotated[tuple[str, str, float] | None, typer.Option(metavar="A B METRES")] = None,
-    height: AtLeastZero = 0.0,  # in their place: of the camera over the floor, metres, the median of its way
+    height: AtLeastZero = 0.0,  # in their place: of the camera over the floor, metres, the median of its path
     weights: WeightsOption = None,
 ) -> int:
     """Give the map of a film metres, and map it again.
@@ -34,7 +34,7 @@ def scale(
     settings of before. Log and results in RUN are replaced once the new ones are whole. A map with measured depth is
     refused: it is in metres.
 
-    Example: semantic-mapper scale runs/film --known 1.20,0.35,0.74 1.95,-0.10,0.75 0.90
+    Example: semantic-mapper scale runs/film --known 1.2,0.3,0.7 1.9,0,0.7 0.75
     Example: semantic-mapper scale runs/film --height 1.5
     """
     refuse_options(
@@ -53,7 +53,8 @@ def scale(
             return stop.exit_code
     output.json(asdict(report))
     output.print(f"{run}: lengths are {report.factor:.4g} times those of before, in metres; scale: {report.scale}")
-    show_result(output, report.summary, run)
+    for line in ending(report.summary, run):
+        output.print(line)
     return 0
 
 

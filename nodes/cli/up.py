@@ -11,15 +11,16 @@ import typer
 
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import EmptyMapError, SemanticMapperError
-from semantic_mapper.nodes.cli.eval import print_results
-from semantic_mapper.nodes.cli.verb import complete, must_be_there, set_option, verb, wrong_usage
+from semantic_mapper.nodes.cli.verb import complete, set_option, verb, wrong_usage
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher.launch_file import Launch, LaunchFile, find_launch, launch_files, load_launch
 from semantic_mapper.nodes.launcher.launcher import Launcher, Notifier
 from semantic_mapper.nodes.options import OPTIONS, CameraOptions, LiveCamera, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import hold_folder
+from semantic_mapper.replay.summary import ending, read_summary
 from semantic_mapper.setting_docs import settings_of
 
 
@@ -68,7 +69,9 @@ def up(
 
 def run_launch(output: Output, launch: Launch, on_ready: Callable[[Path], None] = lambda folder: None) -> None:
     """Run a launch until it ends or somebody asks to stop, and show its results; ``on_ready`` as of ``Launcher``."""
-    must_be_there(*(Path(o.log) for o in launch.options.values() if isinstance(o, CameraOptions) and o.log))
+    for options in launch.options.values():
+        if isinstance(options, CameraOptions) and options.log:
+            open_log(options.log).close()  # what is wrong with it is said before nodes start
     folders = [Path(o.out) for o in launch.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
     with StopRequest() as stop, ExitStack() as stack:
@@ -76,13 +79,16 @@ def run_launch(output: Output, launch: Launch, on_ready: Callable[[Path], None] 
             stack.enter_context(hold_folder(folder))
         stack.enter_context(Launcher(launch, Notifier.from_environment(), on_ready)).run(stop)
     fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
-    results = print_results(output, fresh)
-    for name, summary in results.items():
+    results = [(folder, read_summary(folder)) for folder in fresh]
+    for folder, summary in results:
+        for line in ending(summary, folder):
+            output.print(line)
+    for folder, summary in results:
         if not summary["frames"]["fused"] and not stop:
             why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"]
             why += [summary["map"]["nearly_empty"] or "no frames came"]
             count = summary["frames"]["published"]
-            raise EmptyMapError(f"{name}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
+            raise EmptyMapError(f"{folder}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
 
 
 def _written(folder: Path) -> int:

@@ -153,7 +153,7 @@ _LOWER_IS_BETTER = {
     *("unlabelled", "held_out_loss"),
 }
 # Of logs that have a score in A only, and those that are worse; the first ones are shown first.
-_BAD = {"failed": "failed in B", "missing": "missing in B", "unscored": "without a score in B", "worse": "lost more"}
+_BAD = {"failed": "failed in B", "missing": "missing in B", "unscored": "without a score in B", "worse": "worse"}
 
 
 class Estimate(msgspec.Struct, frozen=True):
@@ -244,7 +244,7 @@ def compare_stores(
     if mean.estimate is not None and max(sign * mean.estimate.low, sign * mean.estimate.high) < -threshold:
         limit = f" by more than {threshold:g}" if threshold else ""
         reasons.append(f"the mean of {metric} over logs is worse{limit}")
-    for status, text in {**_BAD, "worse": f"lost more than {log_threshold:g}"}.items():
+    for status, text in {**_BAD, "worse": f"worse by more than {log_threshold:g}"}.items():
         if count := sum(change.status == status for change in changes):
             reasons.append(f"{counted(count, 'log')} {text}")
     return FleetComparison(operation, metric, lower_is_better, mean, tuple(changes), tuple(reasons))

@@ -31,7 +31,7 @@ from semantic_mapper.replay.session import MapSession, Refusal
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import load_keys
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, NodeState, StreamInfo
+from semantic_mapper.transport.messages import SCALE_KEY, EndOfStream, FrameRefused, NodeState, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 from semantic_mapper.types import MapUpdate, PosedFrame
 
@@ -156,6 +156,7 @@ class MapperNode(Closing):
         self._session = MapSession(
             self._mapper, stream_labels=info.label_set, source=info.source, own_first=not self._options.map
         )
+        self._session.scale_from = info.metadata.get(SCALE_KEY, "")
         if self._mapper.voxel_map.frames:
             self._session.odometry_sessions.known.update(saved_map.noted_sessions(self._context))
         _log.info("stream_begins", source=info.source, frames=info.frame_count)

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from semantic_mapper.errors import CodecError, ConfigError, LogError
+from semantic_mapper.errors import CodecError, ConfigError, EmptyMapError, LogError
 from semantic_mapper.files import open_regular
 from semantic_mapper.replay.log.mcap_scan import Place, Scan, read_attachment, read_payloads, scan
 from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope, unpack_parts
@@ -74,7 +74,8 @@ class LogReader:
 
     A message that is damaged or cannot be decoded becomes a ``LogError`` in ``errors`` (each once) and goes to
     ``on_error``; iteration goes on with the next. A message whose checksum is wrong is never used. Raises LogError: no
-    such file, not an MCAP file, not a log of ours, no frame in it, or several that are not parts of one recording.
+    such file, not an MCAP file, not a log of ours, or several that are not parts of one recording. EmptyMapError: no
+    frame is in it.
 
     Args:
         paths: A file, which may be unfinished (its writer was killed) or cut off; or several parts, in any order.
@@ -114,7 +115,7 @@ class LogReader:
                 self._add_entries(file)
             self.info = self._read_info(self._attachments.pop(INFO_ATTACHMENT, None))
             if not any(entry.topic for entry in self._frames) and not allow_empty:
-                raise LogError(f"{self.path}: the log holds no frames; record or import it again")
+                raise EmptyMapError(f"{self.path}: the log holds no frames; record or import it again")
             self._stack = stack.pop_all()
 
     def __len__(self) -> int:

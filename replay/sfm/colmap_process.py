@@ -166,10 +166,10 @@ def _match(folder: Path, names: list[str], descriptors: list[UInt8], precision: 
             matches = match_features(descriptors[i], descriptors[j])
             database.write_matches(ids[names[i]], ids[names[j]], matches)
             if done % PAIRS_AT_ONCE == 0:
-                _report("match", done, len(pairs))
+                _report("matching", done, len(pairs))
     listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
     pycolmap.verify_matches(folder / DATABASE, listed, verification)
-    _report("match", len(pairs), len(pairs))
+    _report("matching", len(pairs), len(pairs))
 
 
 def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:
@@ -256,7 +256,7 @@ def _map(
 
     def step(images: int) -> None:
         done[0] = min(done[0] + images, count)
-        _report("map", done[0], count)
+        _report("poses", done[0], count)
 
     out = folder / f"attempt-{number}"
     shutil.rmtree(out, ignore_errors=True)

@@ -135,7 +135,7 @@ def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None
     if error_m > MAX_ERROR * spread_m:
         raise ImportSourceError(
             f"the GPS positions are {error_m:.1f} m off (median) within a spread of {spread_m:.1f} m, too much to tell "
-            "the scale; they need a larger way, or a better receiver"
+            "the scale; they need a longer path, or a better receiver"
         )
     return GpsFit(T, scale, known[0], int(inside.sum()), error_m)
 

@@ -188,7 +188,7 @@ class _Import:
 
     def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
         film = self._film
-        self._look = look_through(film, lambda done: self._progress("look", done, max(done, film.count)))
+        self._look = look_through(film, lambda done: self._progress("reading", done, max(done, film.count)))
         if film.unread:
             self._notices.append(
                 f"{film.count - film.unread} of the {film.count} frames that the film announces could be read; it is "
@@ -306,7 +306,7 @@ class _Import:
         """Metres per unit, and how they were found; empty = nothing was given. Raises ImportSourceError: not found."""
         hint = self._options.scale
         if hint.factor is not None:
-            return hint.factor, f"given: {hint.factor:g} m per unit"
+            return hint.factor, f"the stated {hint.factor:g} m per unit"
         if self._board is not None:
             return scale_by_board(self._board_seen, _poses(frames), seen)
         if hint.camera_height_m is not None:
@@ -337,7 +337,7 @@ class _Import:
         focal_px = scene.seen.fx / self._lens.ratio
         with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
             for row, (frame, pose, reason) in enumerate(self._posed(set(picked), scene)):
-                self._progress("write", row + 1, len(look.index))
+                self._progress("writing", row + 1, len(look.index))
                 if pose is not None:
                     rgb = rectify(frame.bgr)
                     at = frame.stamp_ns, frame.index, CAMERA_ID

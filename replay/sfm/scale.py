@@ -102,7 +102,10 @@ def scale_by_floor(height_m: float, floor: Floor | None) -> tuple[float, str]:
             "film more of the floor"
         )
     unsure = ", unsure: little of it is seen, so that the scale may be a tenth off" if floor.unsure else ""
-    return height_m / floor.below, f"camera {height_m:g} m over a floor of {floor.points} points{unsure}"
+    return (
+        height_m / floor.below,
+        f"the stated camera height of {height_m:g} m over a floor of {floor.points} points{unsure}",
+    )
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
@@ -159,7 +162,7 @@ def scale_by_board(
         )
     true, found = (cdist(at, at) for at in (np.array(list(corners)), np.stack(list(corners.values()))))
     pairs = true > 0.5 * true.max()  # long ones are the most exact
-    return float(np.median(true[pairs] / found[pairs])), f"board: {len(corners)} corners in {len(posed)} frames"
+    return float(np.median(true[pairs] / found[pairs])), f"a board, {len(corners)} corners in {len(posed)} frames"
 
 
 MIN_LENGTH = 0.06  # of an edge, of the image's width

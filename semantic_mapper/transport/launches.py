@@ -91,7 +91,9 @@ def launch_folder(place: str) -> Path:
     if running:
         raise TransportError(f"{place}: no launch that runs here; there are: {_listed(running)}")
     named = "" if place in ("", LIVE) else f"{place}: "
-    raise TransportError(f"{named}no launch runs here; `semantic-mapper up LAUNCH.toml` starts one")
+    raise TransportError(
+        f"{named}no launch runs here; `semantic-mapper demo --live` starts one without a camera, `up LAUNCH` any"
+    )
 
 
 def socket_in_launch(place: str, name: str) -> str:

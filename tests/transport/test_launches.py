@@ -38,7 +38,7 @@ def start(stack: ExitStack, name: str, **options: object) -> Path:
 
 
 def test_a_client_finds_the_launch_that_runs_and_the_next_one() -> None:
-    with pytest.raises(TransportError, match="no launch runs here; `semantic-mapper up"):
+    with pytest.raises(TransportError, match="no launch runs here; `semantic-mapper demo --live"):
         MapClient()
     with ExitStack() as first:
         folder = start(first, "replay", query="query")

@@ -70,7 +70,7 @@ def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_pat
     file = tmp_path / "figures" / "eval.json"
     said = run_ok("eval", replayed, "--out", file).stdout
     assert "mIoU" in said and "replayed" in said
-    assert json.loads(file.read_text())["replays"]["replayed"] == summary_of(replayed)
+    assert json.loads(file.read_text())["replays"][str(replayed)] == summary_of(replayed)
 
 
 def test_eval_compares_on_frames_that_nobody_was_fitted_to(

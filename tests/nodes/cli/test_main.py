@@ -24,6 +24,7 @@ def test_help_lists_all_verbs_and_each_explains_itself_with_an_example_in_40_lin
         for columns in (80, 110):
             shown = CliRunner().invoke(cli.app, [*words.split(), "--help"], terminal_width=columns - 2).output
             assert len(shown.splitlines()) <= 40, f"{words} at {columns} columns"
+            assert all(len(line) <= columns for line in shown.splitlines()), f"{words}: wider than {columns} columns"
             assert f"Example: semantic-mapper {words}" in shown or not words or groups.get(words), words
 
 

@@ -48,7 +48,7 @@ def test_one_log_that_lost_much_is_found_among_many_and_comes_first(compared: An
     after = [made_up(n, loss=0.15 if n == 17 else 0.0, noise=0.02, noise_seed=2) for n in range(30)]
     found = compared(logs(30), after)
     assert [log.log for log in found.logs if log.status == "worse"] == ["/logs/0017.mcap"] == [found.logs[0].log]
-    assert found.reasons == ("1 log lost more than 0.02",)
+    assert found.reasons == ("1 log worse by more than 0.02",)
 
 
 def test_logs_that_got_better_are_no_alarm_and_a_threshold_allows_a_small_loss(compared: Any) -> None:

@@ -31,7 +31,7 @@ GUESS = FilmOptions(focal_prior_px=1.1 * films.CAMERA.fx)
 
 
 def quiet(what: str, done: int, total: int) -> None:
-    assert what in ("look", "features", "match", "map", "write") and 0 <= done <= total
+    assert what in ("reading", "features", "matching", "poses", "writing") and 0 <= done <= total
 
 
 def path_error_m(log: Path, truth: tuple[PosedFrame, ...]) -> tuple[float, float]:
