@@ -17,16 +17,19 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.config import to_plain
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
+from semantic_mapper.nodes.cli.query import answer, answer_table
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
+from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_map, map_path
-from semantic_mapper.transport.launches import is_running_mapper
+from semantic_mapper.transport.launches import STATUS_SOCKET, is_running_mapper, socket_in_launch
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
+from semantic_mapper.transport.sockets import NewestSubscriber
 
 BOX_FILES = (".json", ".xml")
 
@@ -43,9 +46,9 @@ def info(
 
     Of a log (topics, frames, cameras, duration, missing frames, damage) it reads every message, so that damage
     anywhere is found; exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file
-    says of itself, which is quick however large the map is. Of a running mapper it lists the weights that it was
-    offered, with what became of them. Boxes are for `finetune --kind panoptic`; any editor changes their file
-    (docs/scenes.md).
+    says of itself, which is quick however large the map is. Of a running mapper: what its map holds, its nodes (as
+    `view --status`, on this machine), and what became of weights that it was offered. Boxes are for `finetune --kind
+    panoptic`; any editor changes their file (docs/scenes.md).
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo
@@ -57,7 +60,7 @@ def info(
     elif path.suffix == ".safetensors":
         found = _weights_file_info(output, path)
     elif is_running_mapper(file[0]):
-        found = _weights_info(output, file[0], remote)
+        found = _live_info(output, file[0], remote)
     elif is_map(path):
         if len(file) > 1:
             raise typer.BadParameter("one map at a time")
@@ -222,22 +225,28 @@ def _map_table(found: dict[str, Any]) -> Table:
     return table(rows, title=found["map"])
 
 
-def _weights_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
-    """The weights of a running mapper."""
+def _live_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
+    """The map and the weights of a mapper that runs; and the nodes, where its launch runs on this machine."""
     with MapClient(place, server=remote.server, keys=remote.keys) as client:
-        state = client.weights()
+        found = {"map": place, **answer(client, "info"), "weights": to_builtins(weights := client.weights())}
+    output.print(answer_table(found))
+    if "://" not in place:
+        with NewestSubscriber(socket_in_launch(place, STATUS_SOCKET), ("status",)) as statuses:
+            launch = LaunchView.whole(statuses)
+        found |= launch.to_json()
+        output.print(launch.table())
     rows = [
         (
-            *(v.version, v.state, v.keyframes or ""),
+            *(v.version, v.state, v.keyframes or "", v.digest[:12]),
             *(f"{score * 100:.1f} %" if v.version else "" for score in (v.score, v.parent_score)),
-            *(v.digest[:12], v.reason),
+            v.reason,
         )
-        for v in state.versions
+        for v in weights.versions
     ]
-    names = ("version", "state", "keyframes", "mIoU held out", "of those before", "file", "reason")
-    counts = f"{counted(state.taken, 'time')} taken, {state.refused} refused, {state.rolled_back} rolled back"
-    output.print(table(rows, names, title=f"weights {state.in_use} in use; {counts}"))
-    return to_builtins(state)
+    names = ("weights", "state", "keyframes", "file", "mIoU held out", "of those before", "reason")
+    counts = f"accepted: {weights.taken}, refused: {weights.refused}, rolled back: {weights.rolled_back}"
+    output.print(table(rows, names, title=f"weights {weights.in_use} in use; {counts}"))
+    return found
 
 
 def _weights_file_info(output: Output, path: Path) -> dict[str, Any]:

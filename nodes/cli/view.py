@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import rich.live
 
-from semantic_mapper.errors import ConfigError, TransportError
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, refuse_options, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher import running
@@ -20,9 +19,6 @@ from semantic_mapper.transport.sockets import NewestSubscriber
 
 if TYPE_CHECKING:
     from semantic_mapper.nodes.viewer.sources import Live
-
-ANSWER_S = 5.0  # how long the launcher may take to say anything
-STATUS_REFRESH_S = 0.5
 
 
 @verb
@@ -52,7 +48,7 @@ def view(
     Example: semantic-mapper view runs/kitchen
     Example: semantic-mapper view tcp://robot:5570 --server robot
     Example: semantic-mapper view --status
-    Example: ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 robot semantic-mapper view
+    Example: ssh -L 9090:localhost:9090 -L 9876:localhost:9876 robot
     """
     refuse_options(((once and not status) or (output.quiet and not once), "--once and --json", "go with --status"))
     if status:
@@ -91,20 +87,15 @@ def _find_live(source: str, remote: Remote) -> Live:
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:
     """A running launch as a table."""
     endpoint = socket_in_launch(place, STATUS_SOCKET)
-    view = running.LaunchView()
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
-        deadline = time.monotonic() + ANSWER_S
-        while not view.complete:
-            if time.monotonic() > deadline:
-                raise TransportError(f"{endpoint}: no launcher has reported its nodes for {ANSWER_S:g} s; does it run?")
-            view.listen(subscriber, STATUS_REFRESH_S)
+        view = running.LaunchView.whole(subscriber)
         if once:
             output.print(view.table())
             output.json(view.to_json())
             return
         with StopRequest() as stop, rich.live.Live(view.table(), console=output.console, auto_refresh=False) as live:
-            while not stop and not view.ended and view.silent_s < ANSWER_S:
-                view.listen(subscriber, STATUS_REFRESH_S)
+            while not stop and not view.ended and view.silent_s < running.ANSWER_S:
+                view.listen(subscriber, running.LISTEN_S)
                 live.update(view.table(), refresh=True)
         if not stop:
             output.print("the launch has ended" if view.ended else "the launcher says nothing any more")

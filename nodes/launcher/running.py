@@ -22,6 +22,7 @@ from semantic_mapper.transport.sockets import NewestSubscriber
 
 START_S = 180.0  # how long nodes may take to start
 LISTEN_S = 0.5
+ANSWER_S = 5.0  # how long the launcher may take to say anything
 RATE_WINDOW_S = 5.0  # over which rates are taken, where so much has been seen
 RATE_LEAST_S = 2.0  # nodes tell their totals once a second
 _KEPT = 64  # statuses a node
@@ -84,8 +85,20 @@ class LaunchView:
             if isinstance(message, Status):
                 self.add(message)
 
+    @classmethod
+    def whole(cls, subscriber: NewestSubscriber) -> LaunchView:
+        """A view of all nodes, as soon as they have been seen for long enough to have rates. Raises TransportError: the
+        launcher says nothing."""
+        view, deadline = cls(), time.monotonic() + ANSWER_S
+        while not view._complete:
+            if time.monotonic() > deadline:
+                where = ", ".join(subscriber.endpoints)
+                raise TransportError(f"{where}: no launcher has reported its nodes for {ANSWER_S:g} s; does it run?")
+            view.listen(subscriber, LISTEN_S)
+        return view
+
     @property
-    def complete(self) -> bool:
+    def _complete(self) -> bool:
         """Whether the launch and all of its nodes have been seen for long enough to have rates."""
         launch = self._history.get(STATUS_SOCKET, [])
         seen = bool(launch) and launch[-1].stamp_ns - launch[0].stamp_ns >= RATE_LEAST_S * 1e9
