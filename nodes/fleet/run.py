@@ -73,7 +73,7 @@ _MAX_EVENTS = 200  # of one log
 _SCORES = ("miou", "total_accuracy", "average_accuracy", "coverage")
 _PACKAGE = Path(semantic_mapper.__file__).parent
 _SOURCES = (".py", ".c", ".h", ".jinja", ".js", ".safetensors")
-_COMPUTING = ("torch", "numpy", "scipy", "open3d", "opencv-contrib-python-headless")
+_COMPUTING = ("torch", "numpy", "scipy", "open3d", "cv2")  # modules: open3d may be of open3d-cpu
 _VERSIONS = ("ETag", "etag", "md5Hash", "crc32c", "mtime", "LastModified", "updated")  # of s3, http, gs, file
 
 _log = get_logger(__name__)
@@ -353,9 +353,9 @@ def _digest(*texts: str) -> str:
 @cache
 def code_digest() -> str:
     """SHA-256 over sources and weights of the package, and the versions of the packages that compute."""
-    digest = hashlib.sha256()
+    digest, packages = hashlib.sha256(), metadata.packages_distributions()
     for name in _COMPUTING:
-        digest.update(f"{name} {metadata.version(name)}\n".encode())
+        digest.update(f"{name} {[metadata.version(package) for package in packages.get(name, ())[:1]]}\n".encode())
     for folder, subfolders, files in os.walk(_PACKAGE, followlinks=True):  # drivers, nodes and replay are links
         subfolders[:] = sorted(s for s in subfolders if s != "__pycache__")
         for name in sorted(files):
