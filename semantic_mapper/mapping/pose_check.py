@@ -60,6 +60,7 @@ _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
     ("translations divided by 1000 (they are millimetres)", _in_metres, 1.0),
     ("depth divided by 5 (scale 5000, not 1000)", lambda T: T, 0.2),
     ("depth multiplied by 5 (scale 1000, not 5000)", lambda T: T, 5.0),
+    *((f"depth multiplied, or positions divided, by {f:.3g}", lambda T: T, f) for f in (0.1, 1 / 3, 0.5, 2, 3, 10)),
 )
 
 

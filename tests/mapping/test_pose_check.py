@@ -71,7 +71,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     "millimetres": (posed(millimetres), "With translations divided by 1000"),
     "depth five times too large": (deeper(5), "With depth divided by 5"),
     "depth five times too small": (deeper(0.2), "With depth multiplied by 5"),
-    "depth halved": (deeper(0.5), "the depth scale and the intrinsics"),
+    "depth halved": (deeper(0.5), "With depth multiplied, or positions divided, by 2"),
 }
 
 
