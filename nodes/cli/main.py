@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
+import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from typing import Annotated, Any
@@ -55,6 +59,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
 VERBS = {name: verb for verbs in GROUPS.values() for name, verb in verbs.items()}
 # Coordinates below 0 and keys look like options.
 _FREE_ARGUMENTS = ("query", "keys")
+_SIGNS = ("=", ":")  # a word each in bash
 
 
 class _Context(typer.Context):
@@ -160,4 +165,23 @@ def _options(
 
 def main() -> None:
     """Entry point of the command."""
-    app()
+    if os.environ.get("_SEMANTIC_MAPPER_COMPLETE") == "complete_bash":
+        _complete_in_bash()
+    app(prog_name=app.info.name)
+
+
+def _complete_in_bash() -> None:
+    """Bash takes NAME=VALUE for three words, and completes the last: Typer gets one, and bash what follows the sign."""
+    words: list[str] = []
+    for word in os.environ["COMP_WORDS"].split("\n")[: int(os.environ["COMP_CWORD"]) + 1]:
+        if words and (word in _SIGNS or words[-1][-1:] in _SIGNS):
+            words[-1] += word
+        else:
+            words.append(word)
+    os.environ.update(COMP_WORDS="\n".join(words), COMP_CWORD=str(len(words) - 1))
+    with suppress(SystemExit), redirect_stdout(io.StringIO()) as found:
+        app(prog_name=app.info.name)
+    before = re.sub(r"[^=:]*$", "", words[-1])
+    for line in found.getvalue().splitlines():
+        typer.echo(line.removeprefix(before))
+    sys.exit()

@@ -16,8 +16,9 @@ from rich.table import Table
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
-from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
 from semantic_mapper.files import write_json
+from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import ALWAYS, length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
@@ -26,6 +27,7 @@ from semantic_mapper.nodes.cli.verb import (
     JsonOutput,
     Remote,
     UpOption,
+    complete_launch,
     must_be_there,
     refuse_options,
     results_file,
@@ -54,14 +56,32 @@ Question = Literal["info", "at", "nearest", "instances", "graph", "correct", "re
 ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correct": "FILE", "relocalize": "LOG"}
 
 
+def _classes(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Classes of the map that is named, for `nearest`; nothing where it cannot be read."""
+    if ctx.params["question"] != "nearest" or ctx.params["arguments"]:
+        return []
+    source = ctx.params["source"]
+    try:
+        if is_running_mapper(source):
+            with MapClient(source, timeout_s=1.0, attempts=1) as client:
+                names = client.info().label_set.names
+        else:
+            names = describe_map(map_path(Path(source))).label_set.names
+    except (SemanticMapperError, OSError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
 @verb
 def query(
     output: JsonOutput,
     # saved map, folder of results, `live`, ipc://PATH or tcp://HOST:PORT
-    source: Annotated[str, typer.Argument(metavar="MAP")],
+    source: Annotated[str, typer.Argument(metavar="MAP", autocompletion=complete_launch)],
     question: Question,
     remote: Remote,
-    arguments: Annotated[list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [FILE]")] = None,
+    arguments: Annotated[
+        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [FILE]", autocompletion=_classes)
+    ] = None,
     *,
     up: UpOption = "auto",
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least

@@ -46,6 +46,7 @@ from semantic_mapper.setting_docs import (
     settings_of,
     without_bounds,
 )
+from semantic_mapper.transport.launches import LIVE, read_launch_note, running_launches
 
 if TYPE_CHECKING:
     from semantic_mapper.transport.keys import ServerIdentity
@@ -91,6 +92,14 @@ def complete(settings: Iterable[Setting], incomplete: str) -> list[str]:
             values = ("true", "false")
         found += [f"{setting.name}={value}" for value in values]
     return [text for text in found if text.startswith(incomplete)]
+
+
+def complete_launch(incomplete: str) -> list[str]:
+    """Launches that run here, by name; nothing before the first letter, so that a shell shows files."""
+    if not incomplete:
+        return []
+    names = [read_launch_note(folder).launch.removesuffix(".toml") for folder in running_launches()]
+    return [name for name in dict.fromkeys((LIVE, *names)) if name.startswith(incomplete)]
 
 
 UpOption = Annotated[

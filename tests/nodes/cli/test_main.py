@@ -9,6 +9,7 @@ from semantic_mapper import __version__
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.main import VERBS
 from tests.contract import entry_points as api
+from tests.contract.golden import MAP
 from tests.nodes.support import refused, run_ok
 
 
@@ -50,13 +51,20 @@ def test_wrong_usage_exits_with_2_and_names_the_nearest(words: str, said: str) -
     assert said in refused(*words.split(), code=2)
 
 
-def test_a_shell_completes_settings_their_values_and_launches() -> None:
+def test_a_shell_completes_settings_their_values_launches_and_classes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("_SEMANTIC_MAPPER_COMPLETE", "complete_bash")
     for words, found in (
-        ("map x --set quality=f", ["quality=fast"]),
+        ("map x --set quality = f", ["fast"]),  # as bash splits words
         ("fleet run map x --set voxel_map.vox", ["voxel_map.voxel_size_m=0.02"]),
         ("up cam", ["camera"]),
         ("up camera --set camera.ki", ["camera.kind="]),
+        ("query li", ["live"]),
+        (f"query {MAP} nearest ch", ["chair"]),
     ):
-        env = {"COMP_WORDS": f"semantic-mapper {words}", "COMP_CWORD": str(len(words.split()))}
-        env["_SEMANTIC_MAPPER_COMPLETE"] = "complete_bash"
-        assert CliRunner().invoke(cli.app, prog_name="semantic-mapper", env=env).output.split() == found, words
+        monkeypatch.setenv("COMP_WORDS", f"semantic-mapper {words}".replace(" ", "\n"))
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+        with pytest.raises(SystemExit):
+            cli.main()
+        assert capsys.readouterr().out.split() == found, words
