@@ -7,7 +7,7 @@ from pathlib import Path
 
 from semantic_mapper.config import AtLeastZero
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, EXIT_USAGE, JsonOutput, show_error, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb, wrong_usage
 from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, read_run
 from semantic_mapper.replay.run_folder import map_path
 
@@ -34,14 +34,11 @@ def compare(
     Example: semantic-mapper compare a/map.npz b/map.npz --exact --json
     """
     tolerances = Tolerances(score=score, surface_m=surface_m, labels=labels)
-    try:
+    with wrong_usage(SemanticMapperError):
         comparison = compare_runs(read_run(a), read_run(b), tolerances)
         if exact:
             other = 0 if filecmp.cmp(map_path(a), map_path(b), shallow=False) else 1
             comparison.figures.append(Difference("other bytes", None, None, other))
-    except SemanticMapperError as error:
-        show_error(str(error))
-        return EXIT_USAGE
     for line in (*comparison.figures, *comparison.notes):
         output.print(str(line))
     different = ", ".join(figure.name for figure in comparison.differences)

@@ -16,12 +16,10 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.cli.verb import (
     EXIT_FAILED,
-    EXIT_USAGE,
     JsonOutput,
     Settings,
     complete,
     set_option,
-    show_error,
     verb,
     wrong_usage,
 )
@@ -180,11 +178,8 @@ def compare(
     Example: semantic-mapper fleet compare runs/a runs/b --metric step_ms_p50
     """
     limits = {"threshold": threshold, "log_threshold": log_threshold, "lower_is_better": lower_is_better}
-    try:
+    with wrong_usage(SemanticMapperError):
         found = compare_stores(Store(store_a), Store(store_b), operation, metric, **limits)
-    except SemanticMapperError as error:
-        show_error(str(error))
-        return EXIT_USAGE
     output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
     _show_comparison(output, found)
     return EXIT_FAILED if found.reasons else 0

@@ -112,11 +112,11 @@ class _UsageError(ConfigError):
 
 
 @contextmanager
-def wrong_usage() -> Generator[None]:
-    """Within, what cannot be a setting or an option is wrong usage (exit code 2)."""
+def wrong_usage(kind: type[SemanticMapperError] = ConfigError) -> Generator[None]:
+    """Within, an error of this kind, such as of what cannot be a setting or an option, is wrong usage (exit code 2)."""
     try:
         yield
-    except ConfigError as error:
+    except kind as error:
         raise _UsageError(str(error)) from error
 
 
@@ -263,25 +263,19 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
                 values["output"] = Output.guarded()
                 values["output"].quiet = with_json and values.pop("json")
             code = function(**values)
-        except SemanticMapperError as error:
-            if Settings.verbose:
-                _log.exception("failed", error=str(error))
-            show_error(str(error))
-            code = EXIT_EMPTY if isinstance(error, EmptyMapError) else EXIT_FAILED
-            if isinstance(error, _UsageError):
-                code = EXIT_USAGE
         except KeyboardInterrupt:
             show_error("interrupted")
             code = EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader of our stdout is gone (`... | head`): nothing is left to be said
             code = EXIT_FAILED
         except Exception as error:
-            if not (message := failure_message(error)):
+            if not (message := str(error) if isinstance(error, SemanticMapperError) else failure_message(error)):
                 raise
             if Settings.verbose:
                 _log.exception("failed")
             show_error(message)
-            code = EXIT_FAILED
+            codes = {_UsageError: EXIT_USAGE, EmptyMapError: EXIT_EMPTY}
+            code = codes.get(type(error), EXIT_FAILED)
         sys.stderr.flush()
         raise typer.Exit(code or 0)
 
