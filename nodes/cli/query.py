@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +17,7 @@ from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
 from semantic_mapper.files import write_json
 from semantic_mapper.mapping.map_file import describe_map
-from semantic_mapper.mapping.map_types import ALWAYS, length_unit
+from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.nodes.cli.verb import (
@@ -41,7 +39,6 @@ from semantic_mapper.queries.graph import GraphTracker, draw_graph
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import at, nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
@@ -49,11 +46,9 @@ from semantic_mapper.replay.run_folder import map_path, prepare_file
 from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
-POLL_S = 0.2
-
 Up = tuple[float, float, float]
-Question = Literal["info", "at", "nearest", "instances", "graph", "correct", "relocalize"]
-ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "correct": "FILE", "relocalize": "LOG"}
+Question = Literal["info", "at", "nearest", "instances", "graph", "relocalize"]
+ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "relocalize": "LOG"}
 
 
 def _classes(ctx: typer.Context, incomplete: str) -> list[str]:
@@ -80,7 +75,7 @@ def query(
     question: Question,
     remote: Remote,
     arguments: Annotated[
-        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [FILE]", autocompletion=_classes)
+        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [LOG]", autocompletion=_classes)
     ] = None,
     *,
     up: UpOption = "auto",
@@ -88,7 +83,6 @@ def query(
     gone: bool = False,  # instances, running mapper: gone ones, too
     unsure: bool = False,  # nearest, instances: also below the least certainty
     picture: Path | None = None,  # graph: also draw it from above (.png)
-    camera: str = "",  # correct: the camera of the poses, of several
     every: AtLeastOne = 1,  # relocalize: every n-th frame
     out: Path | None = None,  # also write the answer as JSON
 ) -> int:
@@ -96,9 +90,8 @@ def query(
 
     info: size and classes. at X Y Z: class at a point, and whether it is free, occupied or unknown. nearest CLASS X
     Y Z: the nearest thing or surface of a class. instances: countable things with upright boxes, certainty and the
-    fraction seen. graph: floors, rooms, doors, and things by room. correct FILE: move the map of a running mapper
-    that keeps frames to corrected poses (TUM). relocalize LOG: find frames with measured depth in a saved map; exit
-    code 1 where they do not agree.
+    fraction seen. graph: floors, rooms, doors, and things by room. relocalize LOG: find frames with measured depth in
+    a saved map; exit code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
@@ -109,8 +102,6 @@ def query(
     with wrong_usage():
         direction, live = parse_up(up), is_running_mapper(source)
     axis: Up | None = None if direction is None else tuple(direction.tolist())
-    if question == "correct":
-        return _correct(output, source, Path(name), camera, remote, live=live)
     refuse_options(
         (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
@@ -204,32 +195,6 @@ def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tupl
         return name, tuple(float(a) for a in arguments)
     except ValueError as error:
         raise typer.BadParameter(f"X Y Z must be numbers, got {' '.join(arguments)}") from error
-
-
-def _correct(output: Output, source: str, file: Path, camera: str, remote: Remote, *, live: bool) -> int:
-    """Send corrected poses to a running mapper."""
-    if not live:
-        raise ConfigError(
-            f"{source}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
-            f"`semantic-mapper map LOG --corrections {file} --out FOLDER`"
-        )
-    trajectory = read_corrections(file)
-    pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
-    poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
-    with MapClient(source, server=remote.server, keys=remote.keys) as client:
-        begun = client.correct_poses(poses, until_ns=ALWAYS, within_ns=MATCH_NS)
-        with frame_progress("correct", None) as bar:
-            state = client.correction()
-            bar.start(state.total)
-            while state.running:
-                bar.set(state.done, f"of {state.total}")  # frames that come meanwhile are added
-                time.sleep(POLL_S)
-                state = client.correction()
-    outcome = f"were given up, the map is as it was: {state.failure}" if state.failure else "are in the map"
-    left_out = f"; {begun.left_out} have no frame in the history and were left out" if begun.left_out else ""
-    output.print(f"{begun.used} corrected poses {outcome}{left_out}")
-    output.json({**asdict(state), "used": begun.used, "left_out": begun.left_out})
-    return EXIT_FAILED if state.failure else 0
 
 
 def _relocalize(output: Output, source: str, log: Path, every: int, *, live: bool) -> dict[str, Any]:

@@ -80,8 +80,6 @@ COMMANDS: dict[str, str] = {
     "autolabel into a log that is there": "autolabel {log} --weights {weights} --out {tmp}/labelled.mcap",
     "eval of pseudo labels": "eval {tmp}/labelled.mcap --weights {weights} --out {tmp}/eval.json",
     "weights of nobody": "info ipc://{tmp}/none",
-    "correct nobody": "query ipc://{tmp}/none correct {corrections}",
-    "correct a saved map": "query {map} correct {corrections}",
     "label without a finetuner": "label {log} --to",
     "label suggests": "label {log} --suggest 2 --json",
     "label sends without weights": "label {log} --weights {weights}",
@@ -183,7 +181,6 @@ def make_places(folder: Path) -> dict[str, str]:
         "poses": "poses.json"
     }
     given = {"log": LOG, "map": stored / MAP.name, "stored": stored, "weights": WEIGHTS, "tmp": folder}
-    given["corrections"] = LOG.parent / "corrections.tum"
     return {name: str(path) for name, path in ({n: folder / f for n, f in made.items()} | given).items()}
 
 

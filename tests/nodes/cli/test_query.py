@@ -72,7 +72,6 @@ def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
         ("row 0", ("query", map_file, "at", "nan", "0", "0")),
         ("no such map file", ("query", tmp_path / "none.npz", "info")),
         ("no floor was found", ("query", map_file, "graph", "--up", "x", "--picture", picture)),
-        ("a saved map keeps no frames to correct", ("query", map_file.parent, "correct", map_file)),
         ("is a map alone; give the folder", ("eval", map_file)),
     ):
         assert said in refused(*words)
