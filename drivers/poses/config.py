@@ -92,8 +92,6 @@ class VisualPoses(Config, frozen=True):
     # Where the scale comes from: a table of "topic" (the robot's odometry, however coarse) or "board" (a printed one,
     # seen at the beginning). The world is the one of these poses then.
     scale: dict[str, Any] = msgspec.field(default_factory=dict)
-    # In its place: from the camera to what is in the middle of the picture that the world begins with.
-    distance_m: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     # In its place, for a camera that is carried at one height over a flat floor that it sees: how high. Every keyframe
     # that sees the floor corrects the scale. Without T_world_start the camera is taken to be level.
     camera_height_m: Annotated[float, msgspec.Meta(ge=0)] = 0.0
@@ -102,8 +100,8 @@ class VisualPoses(Config, frozen=True):
     def __post_init__(self) -> None:
         if self.scale and self.scale.get("kind") not in ("topic", "board"):
             raise ValueError('scale: kind must be "topic" or "board"')
-        if bool(self.scale) + bool(self.distance_m) + bool(self.camera_height_m) > 1:
-            raise ValueError("give one of scale, distance_m and camera_height_m")
+        if self.scale and self.camera_height_m:
+            raise ValueError("give one of scale and camera_height_m")
 
 
 PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses | VisualPoses
@@ -125,7 +123,7 @@ class PoseChecks(Config, frozen=True):
 
 def gives_metres(config: PoseConfig) -> bool:
     """Whether poses are in metres; those of pictures alone have a unit of their own."""
-    return not isinstance(config, VisualPoses) or bool(config.scale or config.distance_m or config.camera_height_m)
+    return not isinstance(config, VisualPoses) or bool(config.scale or config.camera_height_m)
 
 
 def begins_world(config: PoseConfig) -> bool:

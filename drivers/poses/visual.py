@@ -44,8 +44,7 @@ _DRIFT = 0.03  # of the way: what ``sigma`` grows by
 _GAIN = 0.3  # of the way to a new scale that a keyframe goes
 _UNKNOWN = (
     "scale: unknown: poses are up to scale, and nothing in the map is in metres; give the robot's odometry "
-    '(scale = { kind = "topic", endpoint = ... }), a board (scale = { kind = "board", ... }), distance_m or '
-    "camera_height_m"
+    '(scale = { kind = "topic", endpoint = ... }), a board (scale = { kind = "board", ... }) or camera_height_m'
 )
 
 _log = get_logger(__name__)
@@ -142,14 +141,8 @@ class VisualPoseSource(PoseSource):
         if self._config.camera_height_m:
             return self._over_floor(odometry, pose)
         if self._reference is None:
-            if self._world_begun:
-                return pose
-            depth = odometry.center_depth() if self._config.distance_m else 1.0
-            if depth is None:
-                return pose
-            self._metric = bool(self._config.distance_m)
             start = np.array(self._config.T_world_start)
-            return self._begin_world(odometry, pose, (self._config.distance_m or 1.0) / depth, start)
+            return pose if self._world_begun else self._begin_world(odometry, pose, 1.0, start)
         if reference is None:
             return pose
         self._estimator.add(reference[:3, 3], pose[:3, 3])
@@ -266,18 +259,6 @@ class VisualOdometry:
         camera = np.median([k.T_world_camera[:3, 3] for k in self._map.keyframes], axis=0)
         floor = find_floor(np.stack(list(self._map.points.values())), camera, up)
         return None if floor is None else floor.below
-
-    def center_depth(self) -> float | None:
-        """Median distance along the view of points in the middle third of the view that the world begins with; None
-        without any, or once the view is no longer kept."""
-        first = self._map.keyframes[0]
-        if first.number:
-            return None
-        mask, points = self._map.known(first.tracks)
-        z = transform(invert_pose(first.T_world_camera), points)[:, 2]
-        size = np.array((self._intrinsics.width, self._intrinsics.height))
-        middle = (np.abs(first.tracks.pixels[mask] - size / 2) < size / 6).all(axis=1)
-        return float(np.median(z[middle])) if middle.any() else None
 
     def _begin(self, image: UInt8) -> Float64 | None:
         tracks = self._tracker.advance(image)

@@ -64,7 +64,7 @@ NO_NUMBER = [[math.nan, 0, 0, 0], *IDENTITY[1:]]
         ({"kind": "rgbd", "T_world_start": NO_NUMBER}, "poses: T_world_start"),
         ({"kind": "visual", "scale": {"kind": "fixed"}}, 'must be "topic" or "board"'),
         ({"kind": "visual", "scale": {"kind": "board", "colums": 5}}, "did you mean `columns`"),
-        ({"kind": "visual", "scale": {"kind": "board"}, "distance_m": 2.0}, "one of scale, distance_m and camera_hei"),
+        ({"kind": "visual", "scale": {"kind": "board"}, "camera_height_m": 1.0}, "one of scale and camera_height"),
         ({"kind": "fixed", "T_world_rig": np.eye(4).tolist(), "T_world_camera": T_RIG_CAMERA.tolist()}, "T_world_rig"),
         ({**TOPIC, "T_base_camera": T_RIG_CAMERA.tolist()}, "give T_base_camera or"),
         ({**TOPIC, "T_base_rig": (2 * np.eye(4)).tolist()}, "T_base_rig"),

@@ -80,16 +80,7 @@ def test_a_camera_announces_that_its_poses_are_not_in_metres() -> None:
         return with_poses(ListCamera([]), LiveCamera(kind="v4l2", poses={"kind": "visual", **config}), {}).info
 
     assert not announced().scale_known and announced().source == "list"
-    assert announced(distance_m=2.0).scale_known and announced(scale={"kind": "board"}).scale_known
-
-
-def test_a_typed_distance_tells_the_scale() -> None:
-    depth = walk()[0].depth_m
-    assert depth is not None
-    source = VisualPoseSource(VisualPoses(distance_m=float(np.median(depth[80:160, 107:213]))))
-    found, true = poses_of(follow(source, 30))
-    assert source.scale == "known" and "scale: unknown" not in " ".join(source.warnings)
-    assert way_of(found) == pytest.approx(way_of(true), rel=0.25)  # one distance to a scene that is not flat
+    assert announced(camera_height_m=1.0).scale_known and announced(scale={"kind": "board"}).scale_known
 
 
 def test_the_height_over_a_floor_that_is_seen_tells_the_scale_and_where_the_floor_is() -> None:
