@@ -1,4 +1,4 @@
-/* Which voxels of a block a frame says something of; shared by fusion.c and vote_fusion.c. */
+/* Which voxels of a block a frame says something of; shared by fusion.c, clearing.c and virtual_votes.c. */
 #pragma once
 
 #include "camera.h"

@@ -1,4 +1,4 @@
-/* Class votes without a measurement; see mapping/fusion.py. */
+/* Class votes of virtual views, which measure nothing; see mapping/virtual_views.py. */
 #include "voxel_lookup.h"
 
 typedef struct {
