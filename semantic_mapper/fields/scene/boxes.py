@@ -18,6 +18,7 @@ from torch import nn
 
 from semantic_mapper.config import GridConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.scene.grid import RaySamples, SceneGrid, grid_box, ray_fraction
 from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.kernels import parallel_kernel
@@ -67,10 +68,6 @@ class Intervals:
     def inside(self, z: torch.Tensor) -> torch.Tensor:
         """Whether samples at z (R, K) are in intervals: (R, K, M) bool."""
         return (z[..., None] >= self.enter[:, None]) & (z[..., None] <= self.leave[:, None])
-
-    def to(self, device: torch.device) -> Intervals:
-        """The same on a device."""
-        return Intervals(*(t.to(device) for t in (self.enter, self.leave, self.index, self.count)))
 
 
 def trimmed(found: Intervals) -> Intervals:
@@ -179,7 +176,7 @@ class MovingBoxes(nn.Module):
             if len(ray):
                 some = trimmed(Intervals(found.enter[ray], found.leave[ray], found.index[ray], found.count[ray]))
                 device = rays.origin.device
-                yield RaysInBox(number, ray.to(device), _some(own, ray.to(device)), some.to(device))
+                yield RaysInBox(number, ray.to(device), _some(own, ray.to(device)), to_device(some, device))
 
     def composite(self, samples: RaySamples, kept: int) -> RaySamples:
         """Samples with those of the boxes at the rays' time among them, in order, each dimmed by what is before it."""

@@ -219,7 +219,10 @@ class RayTransformer(nn.Module):
         self.enter = nn.Linear(channels_in, WIDTH)
         self.token = nn.Linear(TEXTURE, WIDTH, bias=False) if token else None
         self.token_type = nn.Parameter(0.02 * torch.randn(WIDTH)) if token else None
-        self.layers = nn.ModuleList(Attention(WIDTH, HEADS) for _ in range(LAYERS))
+        self.layers = nn.ModuleList(
+            nn.TransformerEncoderLayer(WIDTH, HEADS, 2 * WIDTH, dropout=0.0, batch_first=True, norm_first=True)
+            for _ in range(LAYERS)
+        )
         self.norm = nn.LayerNorm(WIDTH)
 
     def forward(self, r: torch.Tensor, there: torch.Tensor, texture: RayTexture) -> torch.Tensor:
@@ -231,28 +234,8 @@ class RayTransformer(nn.Module):
             there = torch.cat((there, torch.ones_like(there[:, :1])), 1)
         there = there | ~there.any(1, keepdim=True)
         for layer in self.layers:
-            x = layer(x, there)
+            x = layer(x, src_key_padding_mask=~there)
         return self.norm(x[:, : r.shape[1]])
-
-
-class Attention(nn.Module):
-    """Self-attention, then two linear layers; norms before each."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm, self.qkv, self.out = nn.LayerNorm(width), nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.feed = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)
-        )
-
-    def forward(self, x: torch.Tensor, there: torch.Tensor) -> torch.Tensor:
-        """(R, n, width), of which those ``there`` (R, n) are attended to."""
-        rays, n, width = x.shape
-        q, k, v = self.qkv(self.norm(x)).view(rays, n, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=there[:, None, None])
-        x = x + self.out(mixed.transpose(1, 2).reshape(rays, n, width))
-        return x + self.feed(x)
 
 
 class CarriedLabels(nn.Module):

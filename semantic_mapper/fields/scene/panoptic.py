@@ -19,6 +19,7 @@ from torch import nn
 from semantic_mapper.config import BoxConfig, PanopticConfig, SamplingConfig
 from semantic_mapper.errors import LabelError
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.scene.boxes import Intervals, MovingBoxes, PrimitiveSet, trimmed
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
 from semantic_mapper.fields.scene.irt import at_measured
@@ -148,11 +149,11 @@ class Panoptic(GridField):
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
         z, classes = samples.z.detach(), len(self.label_set)
-        found = trimmed(self.primitives.intervals(samples.rays)).to(z.device)
+        found = to_device(trimmed(self.primitives.intervals(samples.rays)), z.device)
         inside = found.inside(z)
         in_core = torch.zeros_like(inside[..., :1])
         if len(self.cores):
-            cores = trimmed(self.cores.intervals(samples.rays)).to(z.device)
+            cores = to_device(trimmed(self.cores.intervals(samples.rays)), z.device)
             core = cores.inside(z)
             in_core = core.any(-1, keepdim=True)
             within = self._within(found.index, cores.index)
