@@ -101,7 +101,7 @@ class MapperNode(Closing):
                     load_keys(Path(options.keys).expanduser()) if options.keys else None,
                     self._weights or started_with(self._mapper),
                     self._pipeline.moving.space,
-                    self._pipeline.pose_in_map,
+                    lambda: self._pipeline.last_pose,
                 )
                 self._queries = stack.enter_context(service)
             self._resources = stack.pop_all()

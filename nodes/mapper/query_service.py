@@ -12,7 +12,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,7 @@ import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.changes import CopiedChanges
-from semantic_mapper.mapping.map_types import PoseInMap
+from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
@@ -79,7 +79,7 @@ class QueryService(Closing):
         voxel_map: The map; only ``follow`` and ``hand_over`` read its blocks.
         correction, weights: Take corrected poses and other weights; without them such requests are refused.
         moving: Where something moves now that is left out of the map.
-        pose_in_map: Pose of the last frame.
+        last_pose: Gives where the last frame was taken.
     """
 
     def __init__(
@@ -90,14 +90,14 @@ class QueryService(Closing):
         keys: Keys | None = None,
         weights: LiveWeights | questions.Weights | None = None,
         moving: MovingSpace | None = None,
-        pose_in_map: PoseInMap | None = None,
+        last_pose: Callable[[], CameraPose | None] = lambda: None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._map = voxel_map
         self._correction = correction
         self._weights = weights
         self._moving = moving or MovingSpace()
-        self._pose_in_map = pose_in_map or PoseInMap()
+        self._last_pose = last_pose
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         # By direction, the last one used last: a tracker, and what it found last, in which version of the map.
@@ -288,7 +288,7 @@ class QueryService(Closing):
                     raise MapError("this mapper takes no weights while it runs (option `learner`)")
                 return self._weights.describe() if request.to is None else self._weights.return_to(request.to)
             case questions.PoseRequest():
-                return self._pose_in_map.last
+                return self._last_pose()
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
 

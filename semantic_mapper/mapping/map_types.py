@@ -55,13 +55,6 @@ class CameraPose:
     reason: str = ""  # why it is not; empty otherwise
 
 
-class PoseInMap:
-    """Where the last frame was taken, ``last``, for any thread; None before the first."""
-
-    def __init__(self) -> None:
-        self.last: CameraPose | None = None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
     """N points of the fused surface."""

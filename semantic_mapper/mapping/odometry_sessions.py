@@ -44,10 +44,10 @@ class Taken:
 class OdometrySessions:
     """Which odometry sessions are known in a map, and the search for those that are not.
 
-    The map is that of ``pipeline``; classes of a frame have to agree with it, and its ``pose_in_map`` is given the pose
-    of every frame. While the map is being corrected, no world is looked for. With ``own_first`` the first world is the
-    map's own. ``known`` is T_map_world (4, 4) by world, ``found`` counts sessions, ``refused`` looks in vain by reason;
-    ``reason`` says why the last frame was not found."""
+    The map is that of ``pipeline``; classes of a frame have to agree with it, and its ``last_pose`` is kept. While the
+    map is being corrected, no world is looked for. With ``own_first`` the first world is the map's own. ``known`` is
+    T_map_world (4, 4) by world, ``found`` counts sessions, ``refused`` looks in vain by reason; ``reason`` says why the
+    last frame was not found."""
 
     def __init__(self, pipeline: MappingPipeline, *, own_first: bool = True) -> None:
         self._pipeline = pipeline
@@ -102,7 +102,7 @@ class OdometrySessions:
         self._held.append(frame)
         given_up = ((self._held.popleft(), self._why()),) if len(self._held) > HELD else ()
         if not self._look(frame):
-            self._pipeline.pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
+            self._pipeline.last_pose = CameraPose(frame.camera_id, frame.stamp_ns, None, self.reason)
             return Taken(given_up=given_up)
         ready = [f for f in self._held if f.world in self.known]
         self._held = deque(f for f in self._held if f.world not in self.known)
@@ -122,7 +122,7 @@ class OdometrySessions:
         pose = move(self.known[frame.world], frame.T_world_camera)
         self.reason = ""
         in_map = move(self._corrector.motion(frame.world), pose)
-        self._pipeline.pose_in_map.last = CameraPose(frame.camera_id, frame.stamp_ns, in_map)
+        self._pipeline.last_pose = CameraPose(frame.camera_id, frame.stamp_ns, in_map)
         return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
 
     def _look(self, frame: PosedFrame) -> bool:

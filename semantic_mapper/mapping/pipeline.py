@@ -35,7 +35,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction import MapCorrector
 from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
-from semantic_mapper.mapping.map_types import PoseInMap
+from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, upsample
@@ -70,7 +70,8 @@ class MappingPipeline:
     Deterministic: same frames, config, field and thread count give the same map, bit for bit. ``anchors`` are labelled
     keyframes that the field was finetuned on: source views from the first frame on. ``corrector`` moves the map with
     corrected poses, ``frame_depth`` gives frames their depth, ``picture_check`` says what was wrong with pictures,
-    ``domain_check`` whether the weights know such pictures, ``pose_in_map`` where the last frame was.
+    ``domain_check`` whether the weights know such pictures, ``last_pose`` where the last frame was (None before the
+    first), for any thread.
     ``WeightsError``: the field renders other classes than the map holds."""
 
     def __init__(
@@ -87,7 +88,7 @@ class MappingPipeline:
         self.domain_check: DomainCheck | None = None  # where it is known what the weights learned from
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self.moving = MovingFilter(config, label_set)
-        self.pose_in_map = PoseInMap()
+        self.last_pose: CameraPose | None = None
         self._viewpoints = ViewpointChooser(config.seed)
         self._renderer = ViewRenderer(field, config.render, config.sampling)
         self.corrector = MapCorrector(
@@ -136,17 +137,23 @@ class MappingPipeline:
         """The frames that still wait in ``prepare``, oldest first."""
         return self.frame_depth.finish()
 
-    def render_virtual_views(self, views: int = 1) -> tuple[VirtualView, ...]:
-        """Render the map from where no camera stood, at most so many views of most gain, fuse what they say of classes,
-        and return them; every view takes about the time of a frame.
+    def render_virtual_view(self) -> VirtualView | None:
+        """Render the map from where no camera stood, the view of most gain, fuse what it says of classes, and return
+        it; None where no view is worth the time, about that of a frame.
 
         Nothing is measured: TSDF, colours and ``frames`` stay as they are. Deterministic, as part of the sequence of
         steps. A correction of poses rebuilds the map without these votes, and all may be looked at again."""
-        rendered: list[VirtualView] = []
         with self.corrector.lock:
-            while len(rendered) < views and (view := self._render_virtual_view()) is not None:
-                rendered.append(view)
-        return tuple(rendered)
+            known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
+            if not known:
+                return None
+            newest = known[-1]
+            intrinsics = self._intrinsics[newest.camera_id]
+            fitting = [k for k in self.keyframes.keyframes if k.encoded.size == newest.encoded.size]
+            view = self._viewpoints.choose(self.voxel_map, fitting, intrinsics)
+            if view is not None:
+                self._fuse_virtual_view(view, newest, intrinsics)
+            return view
 
     def encode_anchor(self, anchor: PosedFrame) -> Keyframe:
         """A labelled keyframe that a field was finetuned on, as ``exchange_field`` takes it."""
@@ -359,7 +366,7 @@ class MappingPipeline:
         every = self.config.virtual.every_n_frames
         if every and self._steps % every == 0:
             try:
-                self._timed("virtual", self.render_virtual_views)
+                self._timed("virtual", self.render_virtual_view)
             except FrameError as error:  # the frame itself is in the map
                 _log.warning("virtual_view_refused", seq=frame.seq, reason=str(error))
 
@@ -411,16 +418,7 @@ class MappingPipeline:
         assert view.measured is not None
         return view.depth_m, view.measured
 
-    def _render_virtual_view(self) -> VirtualView | None:
-        known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
-        if not known:
-            return None
-        newest = known[-1]
-        intrinsics = self._intrinsics[newest.camera_id]
-        fitting = [k for k in self.keyframes.keyframes if k.encoded.size == newest.encoded.size]
-        view = self._viewpoints.choose(self.voxel_map, fitting, intrinsics)
-        if view is None:
-            return None
+    def _fuse_virtual_view(self, view: VirtualView, newest: Keyframe, intrinsics: CameraIntrinsics) -> None:
         # A ray cast of the map at full size would take longer than the rendering, and the map is no sharper.
         fraction = min(1.0, VIRTUAL_SIZE * self.config.render.scale)
         smaller = scale_intrinsics(intrinsics, round(intrinsics.width * fraction), round(intrinsics.height * fraction))
@@ -433,7 +431,6 @@ class MappingPipeline:
         full = self._upsample(views, rendered, self.voxel_map)
         table = rendered.probabilities.reshape(-1, len(self.label_set)), full.rows
         add_votes(self.voxel_map, view.T_world_camera, smaller, full.depth_m, table)
-        return view
 
 
 class FieldTrial:

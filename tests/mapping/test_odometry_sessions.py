@@ -73,7 +73,7 @@ def test_a_camera_that_comes_back_in_another_world_goes_on_in_the_map() -> None:
     held = 0
     for frame in walk()[1:12:2]:
         results = session.process(abroad(frame))
-        last = session.pipeline.pose_in_map.last
+        last = session.pipeline.last_pose
         assert last is not None and last.stamp_ns == frame.stamp_ns
         if not results:
             held += 1
@@ -133,7 +133,7 @@ def test_frames_are_found_where_a_correction_has_moved_the_map() -> None:
     results: list[MapUpdate | Refusal] = []
     for frame in walk()[3:10:2]:
         results += session.process(abroad(frame))
-    last = session.pipeline.pose_in_map.last
+    last = session.pipeline.last_pose
     assert results and last is not None and last.T_map_camera is not None
     assert off(last.T_map_camera, shift @ walk()[9].T_world_camera)[0] < 0.05
 
