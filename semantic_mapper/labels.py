@@ -89,10 +89,6 @@ class LabelSet:
         """Ids of the classes that come in countable pieces: all but those named in ``stuff`` (see ``STUFF_NAMES``)."""
         return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name not in stuff)
 
-    def moving_ids(self) -> tuple[int, ...]:
-        """Ids of the classes of ``MOVING_NAMES``."""
-        return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name in MOVING_NAMES)
-
     def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
         """Give classes other names, by the present ones; those that then have one name become one, of the lowest id.
 

@@ -12,30 +12,25 @@ NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 6, 1.5
 _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 
 
-def keep_freed_memory() -> bool:
+def keep_freed_memory() -> None:
     """Let this process use freed memory again instead of returning it to the system, from now until it ends.
 
     By default glibc maps each large tensor again and unmaps it when it is freed, and the kernel clears its pages every
     time. The price is that memory stays the process's own at its peak. For processes that do the same work over and
-    over; the library itself never calls this. False where the C library is not glibc, and has no such switch.
+    over; the library itself never calls this.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:
-        return False
-    return bool(mallopt(_MMAP_THRESHOLD, LARGEST)) and bool(mallopt(_TRIM_THRESHOLD, 2 * LARGEST - 1))
+    glibc = ctypes.CDLL(None)
+    glibc.mallopt(_MMAP_THRESHOLD, LARGEST)
+    glibc.mallopt(_TRIM_THRESHOLD, 2 * LARGEST - 1)
 
 
-def give_back_freed_memory() -> bool:
+def give_back_freed_memory() -> None:
     """Return what this process has freed, and the C library still holds in pieces, to the system, once.
 
     A process that runs for hours holds more and more of it, up to a bound: between blocks that live long lie holes. It
-    takes some milliseconds; the library itself never calls this. False where the C library cannot do that.
+    takes some milliseconds; the library itself never calls this.
     """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is None:
-        return False
-    trim(0)
-    return True
+    ctypes.CDLL(None).malloc_trim(0)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

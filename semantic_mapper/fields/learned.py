@@ -26,7 +26,7 @@ from semantic_mapper.config import (
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.volume import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.volume import sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -90,7 +90,7 @@ class LearnedField(nn.Module, ABC):
         with torch.no_grad():
             _, weights = self.render_samples(rays, coarse, sources)
         fine = sample_from_weights(coarse, weights, self.sampling.fine)
-        return merge_samples(coarse, fine)
+        return torch.cat((coarse, fine), dim=1).sort(dim=1).values
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays from encoded source views; differentiable."""

@@ -77,11 +77,6 @@ def sample_from_weights(z: torch.Tensor, weights: torch.Tensor, count: int) -> t
     return (1 / drawn).sort(dim=1).values
 
 
-def merge_samples(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Sorted union of two sample sets of each ray: (R, N), (R, M) -> (R, N + M)."""
-    return torch.cat((a, b), dim=1).sort(dim=1).values
-
-
 def interval_lengths(z: torch.Tensor, direction_norm: torch.Tensor) -> torch.Tensor:
     """Metric lengths delta_k = (z_{k+1} - z_k) |d|; the last interval repeats the one before it.
     ``z``: (R, N) ascending sample depths in metres, N >= 2. ``direction_norm``: (R,) length of the ray direction a

@@ -45,11 +45,6 @@ def make_place(
     return Place(camera_id, stamp_ns, T_world_camera.copy(), points, features.descriptors[deep])
 
 
-def moved_place(place: Place, T_other_world: Float64) -> Place:
-    """A place in another world."""
-    return replace(place, T_world_camera=T_other_world @ place.T_world_camera)
-
-
 def shared_places(ours: Iterable[Place], theirs: Iterable[Place]) -> int:
     """How many places are of the same frame in both: its camera, stamp and features."""
     known = {(p.camera_id, p.stamp_ns): p.descriptors for p in ours}

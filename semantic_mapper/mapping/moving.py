@@ -98,7 +98,8 @@ class MovingFilter:
     def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
         self._config = config.moving
         self._motion = MotionDetector(config.voxel_map.depth_max_m)
-        self._ids = label_set.moving_ids() if config.moving.classes else ()
+        moving = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name in MOVING_NAMES]
+        self._ids = moving if config.moving.classes else []
         if config.moving.classes and not self._ids:
             raise ConfigError(
                 f"moving.classes: none of the classes of '{label_set.name}' moves ({', '.join(sorted(MOVING_NAMES))} "

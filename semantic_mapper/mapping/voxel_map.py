@@ -17,7 +17,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.localization.places import Place, PlaceStore, moved_place, shared_places
+from semantic_mapper.localization.places import Place, PlaceStore, shared_places
 from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.blocks import pack_keys, unpack_keys
@@ -379,7 +379,8 @@ class VoxelMap:
             self.note_scale(other.scale_known)
             self.refined = self.refined or other.refined
             for place in other.places.places:
-                self.places.add(moved_place(place, T_self_other))
+                moved = T_self_other @ place.T_world_camera
+                self.places.add(dataclasses.replace(place, T_world_camera=moved))
 
     def _choose_changes(self, since: int, limit: int, min_weight: float) -> CopiedChanges:
         """The changes; their blocks are read under the lock."""

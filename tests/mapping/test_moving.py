@@ -159,7 +159,7 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     common = int(np.bincount(label[label != ROOMS.ignore_id]).argmax())
     with pytest.raises(ConfigError, match="none of the classes of 'kitti360' moves"):
         MovingFilter(tiny_config(moving={"classes": True}), KITTI360)
-    monkeypatch.setattr("semantic_mapper.labels.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
+    monkeypatch.setattr("semantic_mapper.mapping.moving.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
     on = pipeline(classes=True, motion=False)
     updates = [on.step(f) for f in frames]
     moving = [u.moving for u in updates if u.moving is not None]

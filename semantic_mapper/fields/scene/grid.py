@@ -281,7 +281,8 @@ class GridField(LearnedField):
     """Geometry and colour of one scene, without classes.
 
     A ray is *known* where the field can say a class, which this kind nowhere can: its logits are zeros. A kind that can
-    overrides ``classify``. Of the sampling only ``near_m`` counts: where rays are sampled, the grid says.
+    overrides ``classify`` and says so (``knows_classes``). Of the sampling only ``near_m`` counts: where rays are
+    sampled, the grid says.
     """
 
     kind: ClassVar[str] = "grid"
@@ -289,11 +290,6 @@ class GridField(LearnedField):
     knows_classes = False
     stored_in_half = True
     fitted_steps: torch.Tensor
-
-    def __init_subclass__(cls) -> None:
-        """A kind that overrides ``classify`` knows classes."""
-        super().__init_subclass__()
-        cls.knows_classes = cls.classify is not GridField.classify
 
     def __init__(self, config: GridFieldConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)

@@ -67,6 +67,7 @@ class IRT(GridField):
     """Classes of one scene from its geometry, its colours and the texture of the query's own image."""
 
     kind = "irt"
+    knows_classes = True
     class_rows = ("classifier.weight", "classifier.bias")
     points_of_ray: int = POINTS
     texture_net: type[TextureNet] = TextureNet

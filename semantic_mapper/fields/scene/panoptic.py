@@ -74,6 +74,7 @@ class Panoptic(GridField):
     grids of their own. Raises LabelError: a box of a class that the label set lacks."""
 
     kind = "panoptic"
+    knows_classes = True
     class_rows = ("classifier.weight", "classifier.bias")
     channel_of_box: torch.Tensor  # (P,) int64, of boxes that stand still
     thing: torch.Tensor  # (P,) bool
