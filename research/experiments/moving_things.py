@@ -31,7 +31,7 @@ from research.experiments.put_things import Thing, place_thing, sees_through, wi
 from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, RoomConfig, room_views
 from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON
-from semantic_mapper.config import MapperConfig, convert_config
+from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.evaluation.upright import camera_up, upright_rotation
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import transform, unproject
@@ -111,6 +111,7 @@ class FrameLabels:
 
     def __init__(self, label_set: LabelSet) -> None:
         self.label_set = label_set
+        self.sampling = SamplingConfig()
         self.frame: PosedFrame | None = None
 
     def encode(self, views: SourceViews) -> EncodedViews:
@@ -131,6 +132,9 @@ class FrameLabels:
         logits[known, channel[known]] = 8.0
         depth, zero = rays.prior_depth_m, torch.zeros(len(label))
         return FieldRender(logits, depth, (depth > 0).float(), zero[:, None].expand(-1, 3), zero, known)
+
+    def source_logits(self, sources: EncodedViews) -> None:
+        """No opinion."""
 
 
 class Run:

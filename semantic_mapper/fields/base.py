@@ -9,7 +9,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch.nn import functional
@@ -65,6 +65,8 @@ def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
 class SemanticField(Protocol):
     """What training, finetuning, evaluation and streaming ask of a field."""
 
+    sampling: SamplingConfig  # where ``render`` samples rays; may be exchanged between two renders
+
     @property
     def label_set(self) -> LabelSet:
         """Classes of the rendered logits, in channel order."""
@@ -78,20 +80,8 @@ class SemanticField(Protocol):
         """Render rays from encoded source views; differentiable in training."""
         ...
 
-
-@runtime_checkable
-class Sampled(Protocol):
-    """A field whose ``render`` draws its samples as a setting says, which may change between two renders."""
-
-    sampling: SamplingConfig
-
-
-@runtime_checkable
-class ImageClassifier(Protocol):
-    """A field that may also say what an encoded image shows by itself."""
-
     def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
-        """Logits (m, L, h, w) of m encoded images; None where the field has no such opinion."""
+        """Logits (m, L, h, w) of what m encoded images show by themselves; None where the field has no such opinion."""
         ...
 
 

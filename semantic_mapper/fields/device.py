@@ -93,7 +93,7 @@ def _to_float32(result: Any) -> Any:
 
 
 class DeviceField:
-    """Inference-only field on a device. Satisfies ``SemanticField`` and ``Sampled``.
+    """Inference-only field on a device. Satisfies ``SemanticField``.
 
     Weights, features of keyframes and rays stay on the device. Sums on a GPU come in no fixed order: its renders repeat
     but for the last digits. The model is copied; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
@@ -115,15 +115,6 @@ class DeviceField:
         """Classes of the rendered logits, in channel order."""
         return self.model.label_set
 
-    @property
-    def sampling(self) -> SamplingConfig:
-        """Where rays are sampled; may be exchanged between two renders."""
-        return self.model.sampling
-
-    @sampling.setter
-    def sampling(self, sampling: SamplingConfig) -> None:
-        self.model.sampling = sampling
-
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode views from anywhere; their features are on the device."""
         with torch.inference_mode():
@@ -136,5 +127,6 @@ class DeviceField:
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays of the device from views that ``encode`` has encoded; not differentiable."""
+        self.model.sampling = self.sampling
         with torch.inference_mode():
             return self.model.render(rays, sources)

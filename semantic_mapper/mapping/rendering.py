@@ -16,8 +16,7 @@ import torch
 from torch.nn import functional
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews, ImageClassifier, Sampled, SemanticField
+from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.fields.render import View, render_sparse_view, render_view
 from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.geometry import expect_shape
@@ -49,8 +48,7 @@ class RenderedView(NamedTuple):
 
 
 class ViewRenderer:
-    """Renders views from one field, which has samples to set where ``config.target_hz`` is one (else
-    ``ConfigError``)."""
+    """Renders views from one field."""
 
     def __init__(self, field: SemanticField, config: RenderConfig, sampling: SamplingConfig) -> None:
         self.field = field  # may be exchanged for one of the same kind
@@ -58,8 +56,6 @@ class ViewRenderer:
         self._sampling = sampling
         self._rate_controller: RateController | None = None
         if config.target_hz > 0:
-            if not isinstance(field, Sampled):
-                raise ConfigError(f"render.target_hz needs a field whose samples can be set; {type(field)} has none")
             self._rate_controller = RateController(config.target_hz, config.ray_fraction, sampling)
         self._last = (0, 0)  # rays and samples of the last view, where its time tells of the next one's
 
@@ -94,7 +90,7 @@ class ViewRenderer:
         elif computed:
             sampling = around_computed(sampling)
         samples = 0
-        if isinstance(self.field, Sampled) and sampling.mode == "streaming":
+        if sampling.mode == "streaming":
             self.field.sampling = sampling
             samples = sampling.guided
         view = View(self.field, sources, intrinsics, T_world_camera, prior_m, sampling, 0, measured, stamp_ns)
@@ -110,7 +106,7 @@ class ViewRenderer:
 def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
     """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it is
     known; the view itself where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
-    if weight == 0 or not isinstance(field, ImageClassifier):
+    if weight == 0:
         return view
     with torch.inference_mode():
         logits = field.source_logits(current)
