@@ -228,7 +228,8 @@ def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, q
     config = with_quality(MapperConfig(quality=quality))
     prior, measured = query_prior(query)
     renderer = ViewRenderer(streaming, config.render, config.sampling)
-    return renderer.render(sources, query.intrinsics, query.T_world_camera, prior, query.rgb, measured=measured)
+    view = View(streaming, sources, query.intrinsics, query.T_world_camera, prior, config.sampling, 0, measured)
+    return renderer.render(view, query.rgb)
 
 
 def query_prior(query: PosedFrame) -> tuple[Float32, Bool]:

@@ -18,6 +18,7 @@ from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.fields.domain_check import DomainCheck
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.render import View
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import (
     FrameViews,
@@ -266,16 +267,17 @@ class MappingPipeline:
             return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(views, intrinsics)
-        return renderer.render(
+        view = View(
+            renderer.field,
             stack_views(sources),
             intrinsics,
             frame.T_world_camera,
             prior,
-            views.rgb(intrinsics),
+            self.config.sampling,
             measured=(views.depth(intrinsics) > 0) & (prior > 0) if frame.depth_m is not None else None,
-            computed=frame.depth_sigma_m is not None,
             stamp_ns=frame.stamp_ns,
         )
+        return renderer.render(view, views.rgb(intrinsics), computed=frame.depth_sigma_m is not None)
 
     @property
     def _holds_scene(self) -> bool:

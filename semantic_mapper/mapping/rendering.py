@@ -8,6 +8,7 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false
+from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
@@ -22,7 +23,7 @@ from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion import PROBABILITY_FLOOR
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
 
 SAMPLES_WITHOUT_DEPTH = 32  # a ray, of views of which neither sensor nor map knows any depth
 LEAST_SAMPLES = 2
@@ -64,23 +65,11 @@ class ViewRenderer:
         if self._rate_controller is not None:
             self._rate_controller.note(render_ms, other_ms, *self._last)
 
-    def render(
-        self,
-        sources: EncodedViews,
-        intrinsics: CameraIntrinsics,
-        T_world_camera: Float64,
-        prior_m: Float32,
-        rgb: UInt8,
-        *,
-        measured: Bool | None = None,
-        computed: bool = False,
-        stamp_ns: int | None = None,
-    ) -> RenderedView:
-        """Render one view, (h, w), from sources at a pose (4, 4).
+    def render(self, view: View, rgb: UInt8, *, computed: bool = False) -> RenderedView:
+        """Render a view (h, w) of the field, with samples as the settings, or the rate to hold, say.
 
-        ``prior_m`` is (h, w) float32 depth, 0 = none; ``rgb`` (h, w, 3) uint8. ``measured`` (h, w) is where the prior
-        is not filled in, None = wherever there is one; ``computed``: it was computed from pictures and may be farther
-        off. ``stamp_ns`` is for fields with things that move; None = such things are not there."""
+        ``rgb`` is (h, w, 3) uint8; ``computed``: the depth prior was computed from pictures and may be farther off."""
+        prior_m = view.prior_depth_m
         fraction, sampling = self._config.ray_fraction, self._sampling
         if self._rate_controller is not None:
             fraction, sampling = self._rate_controller.choose(prior_m.size)
@@ -93,7 +82,7 @@ class ViewRenderer:
         if sampling.mode == "streaming":
             self.field.sampling = sampling
             samples = sampling.guided
-        view = View(self.field, sources, intrinsics, T_world_camera, prior_m, sampling, 0, measured, stamp_ns)
+        view = replace(view, sampling=sampling)
         if fraction == 1:
             probabilities, known, depth_m = render_view(view)
             rays = prior_m.size

@@ -33,9 +33,9 @@ def test_bench_reports_ratios_of_renderers_that_agree():
 def test_the_renderer_is_asked_as_the_mapper_asks_it(monkeypatch: pytest.MonkeyPatch):
     asked, render = [], ViewRenderer.render
 
-    def recorded(self, sources, intrinsics, pose, prior, rgb, *, measured=None, **rest):
-        asked.append((prior, measured))
-        return render(self, sources, intrinsics, pose, prior, rgb, measured=measured, **rest)
+    def recorded(self, view, rgb, **rest):
+        asked.append((view.prior_depth_m, view.measured))
+        return render(self, view, rgb, **rest)
 
     monkeypatch.setattr(ViewRenderer, "render", recorded)
     (scene,) = room_scenes(1, INTRINSICS)
