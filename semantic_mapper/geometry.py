@@ -144,6 +144,29 @@ def nearest_pose(T: Float64) -> Float64:
     return exact
 
 
+def align_similar(a: Float64, b: Float64) -> tuple[Float64, float]:
+    """The similarity that takes points a (N, 3) nearest to points b (N, 3) in least squares: ``T_b_a @ (scale * a)``.
+
+    Umeyama's closed form. Where the points lie on a line, one of the equally good rotations. Raises ShapeError: other
+    shapes, fewer than 3 points, or points a that are all one.
+    """
+    sizes = expect_shape(a, "N 3", "points to align")
+    if expect_shape(b, "N 3", "points to align to") != sizes or sizes["N"] < 3:
+        raise ShapeError(f"alignment needs as many points on both sides, 3 or more; got {len(a)} and {len(b)}")
+    center_a, center_b = a.mean(axis=0), b.mean(axis=0)
+    level_a, level_b = a - center_a, b - center_b
+    size = float((level_a**2).sum())
+    if not size > 0:
+        raise ShapeError("alignment needs points that are not all one")
+    u, _, vt = np.linalg.svd(level_b.T @ level_a)
+    R = u @ np.diag((1.0, 1.0, float(np.sign(np.linalg.det(u) * np.linalg.det(vt))))) @ vt  # a rotation, no mirror
+    scale = float(((level_a @ R.T) * level_b).sum()) / size
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = R
+    T_b_a[:3, 3] = center_b - scale * R @ center_a
+    return T_b_a, scale
+
+
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
     """Metres and radians between two poses (4, 4)."""
     T_a_b = invert_pose(T_world_a) @ T_world_b

@@ -12,10 +12,12 @@ from hypothesis.extra import numpy as hnp
 
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import (
+    align_similar,
     check_pose,
     expect_shape,
     invert_pose,
     look_at,
+    make_pose,
     project,
     scale_intrinsics,
     select_views,
@@ -149,6 +151,33 @@ def test_scaled_intrinsics_see_the_same_corners_and_scale_back(
         assert (new[1] - scaled.cy) / scaled.fy == pytest.approx((old[1] - camera.cy) / camera.fy, abs=1e-9)
     back = scale_intrinsics(scaled, camera.width, camera.height)
     assert dataclasses.astuple(back)[:6] == pytest.approx(dataclasses.astuple(camera)[:6], abs=1e-9)
+
+
+# Alignment
+
+
+def test_alignment_is_the_best_there_is(rng: np.random.Generator) -> None:
+    a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    best, scale = align_similar(a, b)
+
+    def cost(T: np.ndarray, scale: float) -> float:
+        return float(((scale * a @ T[:3, :3].T + T[:3, 3] - b) ** 2).sum())
+
+    assert np.allclose(best[:3, :3] @ best[:3, :3].T, np.eye(3)) and np.linalg.det(best[:3, :3]) > 0
+    for _ in range(300):
+        other = best @ make_pose(rng.normal(0, 0.02, 3), rng.normal(0, 0.02, 3))
+        assert cost(other, scale * rng.uniform(0.97, 1.03)) >= cost(best, scale)
+
+
+def test_alignment_finds_the_similarity_and_refuses_a_single_place(rng: np.random.Generator) -> None:
+    a, T = rng.normal(size=(30, 3)), make_pose((0.3, -2.0, 1.1), (5, -3, 2))
+    found, scale = align_similar(a, 2.5 * a @ T[:3, :3].T + T[:3, 3])
+    assert scale == pytest.approx(2.5) and np.allclose(found, T)
+    with pytest.raises(ShapeError, match="not all one"):
+        align_similar(np.ones((5, 3)), a[:5])
+    for some, others in ((a[:5], a[:4]), (a[:2], a[:2])):
+        with pytest.raises(ShapeError, match="as many points"):
+            align_similar(some, others)
 
 
 # Rays

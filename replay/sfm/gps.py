@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.evaluation.trajectory import align_similar
+from semantic_mapper.geometry import align_similar
 from semantic_mapper.plain_text import counted
 from semantic_mapper.types import Float64
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from semantic_mapper.evaluation.trajectory import align_rigid
-from semantic_mapper.geometry import invert_pose
+from semantic_mapper.geometry import align_similar, invert_pose
 from semantic_mapper.types import Float64
 
 
@@ -19,6 +18,13 @@ class TrajectoryError(NamedTuple):
     median_m: float
     max_m: float
     rmse_deg: float = 0.0
+
+
+def align_rigid(a: Float64, b: Float64) -> Float64:
+    """The rigid motion T_b_a (4, 4) that takes points a (N, 3) nearest to points b (N, 3) in least squares."""
+    T_b_a, _ = align_similar(a, b)  # whose rotation does not depend on the scale
+    T_b_a[:3, 3] = b.mean(axis=0) - T_b_a[:3, :3] @ a.mean(axis=0)
+    return T_b_a
 
 
 def absolute_trajectory_error(estimated: Float64, truth: Float64) -> TrajectoryError:

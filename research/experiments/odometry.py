@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from research.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
+from research.evaluation.trajectory import absolute_trajectory_error, align_rigid, relative_pose_error
 from research.plots import draw_paths
 from semantic_mapper.config import convert_config, read_toml
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
-from semantic_mapper.evaluation.trajectory import align_rigid
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.format import LogReader, LogWriter

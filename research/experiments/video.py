@@ -31,8 +31,7 @@ from research.scenes.config import CameraPathConfig, NoiseConfig
 from research.scenes.render import render_view
 from research.scenes.room import make_room
 from research.scenes.shots import sequence_shots
-from semantic_mapper.evaluation.trajectory import align_similar
-from semantic_mapper.geometry import interpolate_pose, transform
+from semantic_mapper.geometry import align_similar, interpolate_pose, transform
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.importers.base import ImportOptions
 from semantic_mapper.replay.importers.folder import open_folder

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError, SemanticMapperError
-from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, move, transform
+from semantic_mapper.geometry import check_pose, interpolate_pose, invert_pose, move, nearest_pose, transform
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.blocks import ScratchFile
 from semantic_mapper.mapping.keyframes import KeyframeStore
@@ -98,9 +98,7 @@ def _motion(pair: PosePair) -> Float64:
     """T_new @ T_old^-1, its rotation made orthonormal, so that rounding errors of poses do not add up."""
     if np.array_equal(pair.new, pair.old):
         return np.eye(4)
-    motion = pair.new @ invert_pose(pair.old)
-    u, _, vt = np.linalg.svd(motion[:3, :3])
-    motion[:3, :3] = u @ vt
+    motion = nearest_pose(pair.new @ invert_pose(pair.old))
     motion[:3, 3] = pair.new[:3, 3] - motion[:3, :3] @ pair.old[:3, 3]
     return motion
 

@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.evaluation.trajectory import align_similar
-from semantic_mapper.geometry import look_at, transform
+from semantic_mapper.geometry import align_similar, look_at, transform
 from semantic_mapper.replay.sfm import colmap
 from semantic_mapper.replay.sfm.colmap import read_model
 from semantic_mapper.replay.sfm.colmap_process import main

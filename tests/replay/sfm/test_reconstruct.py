@@ -13,8 +13,7 @@ import pytest
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
-from semantic_mapper.evaluation.trajectory import align_similar
-from semantic_mapper.geometry import transform
+from semantic_mapper.geometry import align_similar, transform
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.film import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
