@@ -228,8 +228,9 @@ def _map_table(found: dict[str, Any]) -> Table:
 def _live_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
     """The map and the weights of a mapper that runs; and the nodes, where its launch runs on this machine."""
     with MapClient(place, server=remote.server, keys=remote.keys) as client:
-        found = {"map": place, **answer(client, "info"), "weights": to_builtins(weights := client.weights())}
-    output.print(answer_table(found))
+        weights, about = client.weights(), answer(client, "info")
+    found = {"mapper": place, "info": about, "weights": to_builtins(weights)}
+    output.print(answer_table({"map": place, **about}))
     if "://" not in place:
         with NewestSubscriber(socket_in_launch(place, STATUS_SOCKET), ("status",)) as statuses:
             launch = LaunchView.whole(statuses)

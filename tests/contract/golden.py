@@ -6,15 +6,17 @@ import dataclasses
 import enum
 import hashlib
 import json
+import re
 from base64 import b64decode
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+REPOSITORY = Path(__file__).parents[2]
 FOLDER = Path(__file__).parent / "golden"
 LOG = FOLDER / "room.mcap"
 WEIGHTS = FOLDER / "small.safetensors"
@@ -113,6 +115,34 @@ def form(value: Any) -> Any:
     if isinstance(value, list):
         return [form(item) for item in value[:1]]
     return type(value).__name__
+
+
+def undocumented(verb: str, found: Any) -> list[str]:
+    """Fields of the form of a verb's JSON that docs/json.md has not, or with another type."""
+    page = (REPOSITORY / "docs" / "json.md").read_text(encoding="utf-8")
+    section = page.partition(f"\n## {verb}\n")[2].partition("\n## ")[0]
+    rows = [re.split(r" {2,}", line) for line in section.splitlines() if "  " in line]
+    kinds = [(re.escape(name).replace("NAME", ".+"), row[1]) for row in rows for name in row[0].split(", ")]
+
+    tables = [name for name, of in kinds if "table" in of]
+    return [
+        f"{place}: {kind}"
+        for place, kind in _leaves(found)
+        if not any(re.fullmatch(name, place) and kind in of for name, of in kinds)
+        and not any(re.match(rf"{name}[.[]", f"{place}.") for name in tables)
+    ]
+
+
+def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
+    """Places of a form, and what is there as docs/json.md calls it; nothing of an empty list."""
+    inner = value.items() if isinstance(value, dict) else [("[]", item) for item in value]
+    for name, item in inner:
+        at = f"{place}.{name}".lstrip(".").replace(".[]", "[]")
+        if isinstance(item, str):
+            found = {"str": "text", "float": "number", "NoneType": "null"}.get(item, item)
+            yield at.rstrip("[]"), f"{'[' * at.count('[]', len(at.rstrip('[]')))}{found}"
+        else:
+            yield from _leaves(item, at)
 
 
 def lacking(then: Any, now: Any, where: str = "") -> list[str]:

@@ -6,12 +6,14 @@ import json
 from pathlib import Path
 
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from tests.contract.golden import form, undocumented
 from tests.nodes.support import refused, run, run_process
 
 
 def test_it_finds_what_the_tests_themselves_need(tmp_path: Path) -> None:
     done = run_process("doctor", "--json", cwd=tmp_path)
     checks = {c["name"]: c for c in json.loads(done.stdout)}
+    assert undocumented("doctor", form([*checks.values()])) == []
     for name in ("packages", "Open3D", "torch", "sockets", "CPU", "disk"):
         assert checks[name]["state"] == "ok", checks[name]
     assert (checks["weights"]["state"] == "ok") == default_checkpoint_path().is_file()

@@ -5,10 +5,12 @@ from __future__ import annotations
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.replay.bench import bench_pipeline
 from semantic_mapper.replay.log import demo_log
+from tests.contract.golden import form, undocumented
 
 
 def test_pipeline_reports_its_rate_its_stages_and_what_the_labels_are_worth() -> None:
     found = bench_pipeline(demo_log(), None, with_quality(MapperConfig(quality="fast")), frames=1)
+    assert undocumented("bench", form(found)) == []
     assert found["hz"] > 0 and found["p95_ms"] >= found["p50_ms"]
     assert {"encode", "render", "fuse"} <= set(found["stages_ms"])
     assert sum(found["stages_ms"].values()) <= found["p95_ms"] * 1.05

@@ -21,6 +21,7 @@ from semantic_mapper.replay.rescale import rescale_run
 from semantic_mapper.replay.summary import read_summary
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, SCENE_DEPTH_KEY, StreamInfo
 from semantic_mapper.types import CameraIntrinsics
+from tests.contract.golden import form, undocumented
 from tests.drawn_room import truth_of, walk_frames
 from tests.nodes.support import refused, run_ok
 
@@ -62,6 +63,7 @@ def test_the_height_of_the_camera_scales_log_and_map(run: Path) -> None:
     before, height_m = points(run), float(np.median(truth_of(WALK)[:, 2, 3]))
     report = rescale_run(run, height_m)
     assert report.factor == pytest.approx(1 / UNIT, rel=0.03)
+    assert undocumented("scale", form(dataclasses.asdict(report))) == []
     with LogReader(run / "room.mcap") as log:
         assert log.info.scale_known and float(log.info.metadata[SCENE_DEPTH_KEY]) == pytest.approx(1.875, rel=0.03)
         for frame, old in zip(log, WALK, strict=True):

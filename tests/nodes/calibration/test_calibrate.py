@@ -21,6 +21,7 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
+from tests.contract.golden import form, undocumented
 from tests.drivers.calibrating.boards import BOARD, LENS, picture, shown
 from tests.drivers.support import write_film
 from tests.mapping.test_blocks import files_at_most
@@ -51,6 +52,7 @@ def test_a_folder_becomes_a_file_that_drivers_read_and_a_picture(pictures: Path,
     out, sheet = tmp_path / "made", tmp_path / "sheet.png"
     done = run_ok("calibrate", pictures, "--config", config, "--out", out, "--board", sheet, "--json")
     told = json.loads(done.stdout)
+    assert undocumented("calibrate", form(told)) == []
     read = load_calibration(out / "camera.toml")
     assert abs(read.fx / LENS.fx - 1) < 0.005 and (read.width, read.height) == (640, 480)
     assert told["cameras"]["camera"]["fx"] == read.fx and told["cameras"]["camera"]["k1"] == read.distortion[0]

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
 from msgspec.structs import replace
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.fleet.results import FleetComparison, compare_stores
 from semantic_mapper.nodes.fleet.store import TaskResult
+from tests.contract.golden import form, undocumented
 from tests.nodes.fleet.made_up import FINISHED_NS, failure_of, made_up, store_of
 
 
@@ -49,6 +51,7 @@ def test_one_log_that_lost_much_is_found_among_many_and_comes_first(compared: An
     found = compared(logs(30), after)
     assert [log.log for log in found.logs if log.status == "worse"] == ["/logs/0017.mcap"] == [found.logs[0].log]
     assert found.reasons == ("1 log worse by more than 0.02",)
+    assert undocumented("fleet compare", form({"worse": True, **to_builtins(found)})) == []
 
 
 def test_logs_that_got_better_are_no_alarm_and_a_threshold_allows_a_small_loss(compared: Any) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
 
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError
 from semantic_mapper.nodes.fleet import run
@@ -17,6 +18,7 @@ from semantic_mapper.nodes.fleet.cluster import connected
 from semantic_mapper.nodes.fleet.run import RunReport, Task, run_fleet, run_task
 from semantic_mapper.nodes.fleet.store import LogInput, Store, TaskResult
 from semantic_mapper.replay.summary import read_summary
+from tests.contract.golden import form, undocumented
 from tests.nodes.fleet.tasks import do_as_named
 
 
@@ -140,6 +142,7 @@ def test_every_log_is_done_once_and_the_rest_goes_on_without_those_that_fail(tmp
     names = [f"log{n:02}" for n in range(20)]
     report = run_logs(tmp_path, *names, "exists", "bad", "away-once", "dies-once", "dies")
     assert (report.total, report.done, report.existing, len(report.failures)) == (25, 22, 1, 2)
+    assert undocumented("fleet run", form(to_builtins(report))) == []
     expected = [*(f"{name}.0" for name in names), "exists.0", "bad.0"]
     expected += ["away-once.0", "away-once.1", "dies-once.0", "dies-once.1", *(f"dies.{n}" for n in range(4))]
     assert traces(tmp_path) == sorted(expected)
