@@ -144,7 +144,7 @@ class NodeProcess:
 def _start_interpreter(kind: str, job: int, heartbeat: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         # -I: a sourced workspace on PYTHONPATH, or a file in the current folder, cannot shadow our modules.
-        [sys.executable, "-I", "-m", f"semantic_mapper.nodes.{kind}", f"{JOB_PREFIX}{job}"],
+        [sys.executable, "-I", "-m", "semantic_mapper.nodes", kind, f"{JOB_PREFIX}{job}"],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -20,8 +20,8 @@ import pytest
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.finetuner import finetuner
-from semantic_mapper.nodes.finetuner.__main__ import run as run_finetuner
 from semantic_mapper.nodes.finetuner.finetuner import FinetuneRound
+from semantic_mapper.nodes.finetuner.process import run as run_finetuner
 from semantic_mapper.nodes.options import FinetunerOptions
 from semantic_mapper.nodes.process import run_when_idle
 from semantic_mapper.training.config import OnlineConfig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from semantic_mapper.nodes.node import NodeContext, run_node
+from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions
 
 
@@ -18,7 +18,3 @@ def run(context: NodeContext, options: FinetunerOptions) -> None:
 
     torch.set_num_threads(options.threads)
     finetuner.run_finetuner(context, options)
-
-
-if __name__ == "__main__":
-    run_node(FinetunerOptions, run)
