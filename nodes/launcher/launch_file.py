@@ -17,8 +17,7 @@ import msgspec
 
 import semantic_mapper
 from semantic_mapper.config import Config, assign, convert_config, load_config, nearest, parse_value, split_assignment
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.camera.ids import check_camera_ids
+from semantic_mapper.errors import ConfigError, LogError
 from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
     ENDPOINT_PATTERN,
@@ -34,6 +33,7 @@ from semantic_mapper.nodes.options import (
     RecorderOptions,
     check_tracking,
 )
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.launches import STATUS_SOCKET
 
 LAUNCH_FOLDER = Path(semantic_mapper.__file__).parent / "launch_files"  # ``launch/`` of the top level
@@ -302,7 +302,7 @@ def _check_launch(launch: Launch) -> None:
             for source in own.cameras:
                 if source not in cameras:
                     raise ValueError(f"node '{name}' takes the frames of '{source}', which is no camera")
-            check_camera_ids(name, {source: cameras[source] for source in own.cameras})
+            _check_camera_ids(name, {source: cameras[source] for source in own.cameras})
         if isinstance(own, FoxgloveOptions) and not isinstance(options[own.mapper], MapperOptions):
             raise ValueError(f"node '{name}' shows the map of '{own.mapper}', which is no mapper")
     restarted = [n.name for n in launch.nodes if n.restart != "never"]
@@ -316,3 +316,33 @@ def _check_launch(launch: Launch) -> None:
     if twice := sorted({name for name in sockets if sockets.count(name) > 1}):
         own = f"'{STATUS_SOCKET}' is the launcher's own"
         raise ValueError(f"{', '.join(twice)}: names two endpoints; give each mapper a `query` of its own ({own})")
+
+
+def _check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions]) -> None:
+    """Raise ``ValueError`` for frames of one name from two cameras, by node name, that node ``reader`` takes."""
+    if len(cameras) < 2:
+        return
+    taken: dict[str, str] = {}
+    for node, options in cameras.items():
+        for name in _camera_ids(options):
+            other = taken.setdefault(name, node)
+            if other == node:
+                continue
+            fix = "give each its own `id`"
+            if options.log is not None or cameras[other].log is not None:
+                fix = (
+                    "frames of a log keep the names that they were recorded under: record one again with another `id`, "
+                    "or give each log a mapper of its own; parts of one recording are one node with their folder"
+                )
+            raise ValueError(f"two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {fix}")
+
+
+def _camera_ids(options: CameraOptions) -> tuple[str, ...]:
+    """Of a camera, or of those in a log; none where the log cannot be read, which its node will say."""
+    if options.camera is not None:
+        return (options.camera.id,)
+    try:
+        with open_log(Path(str(options.log))) as log:
+            return tuple(log.info.cameras)
+    except (LogError, OSError):
+        return ()
