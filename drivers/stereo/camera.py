@@ -13,14 +13,19 @@ from semantic_mapper.drivers import registry
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import load_stereo
 from semantic_mapper.drivers.live import NOT_CALIBRATED
+from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.drivers.stereo.config import Config
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.drivers.v4l2 import devices
-from semantic_mapper.drivers.v4l2.devices import list_stereo as list_devices  # noqa: F401 -- see the registry
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import UInt8
 
 _OURS = ("device", "calibration", "uncalibrated", "width", "height")  # of the device's driver, set here
+
+
+def list_devices() -> list[FoundCamera]:
+    """None: a pair is listed as the device of kind v4l2 that it is."""
+    return []
 
 
 class StereoCamera(Camera):
@@ -30,8 +35,8 @@ class StereoCamera(Camera):
         where = f"stereo pair at {config.device}"
         if not config.device:
             raise CameraError(
-                f"camera '{camera_id}': no device is named; `doctor --cameras --kind stereo` lists what may be "
-                'one; give its address as device = "/dev/v4l/by-id/..."'
+                f"camera '{camera_id}': no device is named; `doctor --cameras` lists what is connected; give its "
+                'address as device = "/dev/v4l/by-id/..."'
             )
         if not config.calibration:
             raise CameraError(

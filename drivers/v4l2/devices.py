@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 
 import semantic_mapper.drivers.v4l2.ioctls as ioctls
 from semantic_mapper.drivers.registry import FoundCamera
 
 SHOWN_FORMATS = 8
-WIDER = 2.4  # width over height, of two images side by side; the widest single ones are 21:9
 DEVICES = Path("/dev")
 LINKS = (Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path"))  # by model and serial number; by the port it hangs on
 
@@ -49,18 +47,4 @@ def list_devices() -> list[FoundCamera]:
         except OSError as error:
             note = f"does not answer: {error.strerror} (without permission: add yourself to the group `video`)"
             found.append(FoundCamera("v4l2", "?", str(node), note))
-    return found
-
-
-def list_stereo() -> list[FoundCamera]:
-    """Cameras with images as wide as two side by side; one that cannot be opened is in ``list_devices``."""
-    found: list[FoundCamera] = []
-    for node in video_nodes():
-        with suppress(OSError), ioctls.opened(node) as fd:
-            who = ioctls.query_capability(fd)
-            sizes = ioctls.list_sizes(fd) if who.captures else ()
-            wide = [f"{width}x{height}" for width, height in sizes if width > WIDER * height]
-            if wide:
-                note = f"{node.name}; side by side {' '.join(wide)}"
-                found.append(FoundCamera("stereo", who.card, str(stable_path(node)), note))
     return found

@@ -30,7 +30,6 @@ LOWEST, HIGHEST = -(2**31), 2**31 - 1  # value of a control; ctypes would pass o
 _CAP_VIDEO_CAPTURE = 0x00000001
 _CAP_DEVICE_CAPS = 0x80000000
 _BUF_TYPE_VIDEO_CAPTURE = 1
-_FRAMESIZE_DISCRETE = 1
 _CTRL_FLAG_DISABLED = 0x0001
 _CTRL_FLAG_NEXT = 0x80000000
 _FOURCC_BIG_ENDIAN = 1 << 31
@@ -51,8 +50,6 @@ _Capability = _structure(
 _Format = _structure(
     index=_u32, type=_u32, flags=_u32, description=_text32, pixelformat=_u32, mbus_code=_u32, rest=_u32 * 3
 )
-# Of a discrete size the union begins with width and height.
-_FrameSize = _structure(index=_u32, pixelformat=_u32, type=_u32, size=_u32 * 6, rest=_u32 * 2)
 _QueryControl = _structure(
     id=_u32, type=_u32, name=_text32, minimum=_i32, maximum=_i32, step=_i32, default=_i32, flags=_u32, rest=_u32 * 2
 )
@@ -66,7 +63,6 @@ def _number(direction: int, number: int, kind: Any) -> int:
 _READ, _WRITE = 2, 1
 QUERYCAP = _number(_READ, 0, _Capability)
 ENUM_FMT = _number(_READ | _WRITE, 2, _Format)
-ENUM_FRAMESIZES = _number(_READ | _WRITE, 74, _FrameSize)
 G_CTRL = _number(_READ | _WRITE, 27, _ControlValue)
 S_CTRL = _number(_READ | _WRITE, 28, _ControlValue)
 QUERYCTRL = _number(_READ | _WRITE, 36, _QueryControl)
@@ -113,22 +109,8 @@ def query_capability(fd: int) -> Capability:
 
 def list_formats(fd: int) -> tuple[str, ...]:
     """FOURCC of each pixel format that it offers."""
-    return tuple(fourcc_text(pixels) for pixels in _formats(fd))
-
-
-def list_sizes(fd: int) -> tuple[tuple[int, int], ...]:
-    """Width and height of each image size that it offers, the largest first; none of a device that scales freely."""
-    sizes = {
-        (row.size[0], row.size[1])
-        for pixels in _formats(fd)
-        for row in _rows(fd, ENUM_FRAMESIZES, lambda i: _FrameSize(index=i, pixelformat=pixels))  # noqa: B023
-        if row.type == _FRAMESIZE_DISCRETE
-    }
-    return tuple(sorted(sizes, reverse=True))
-
-
-def _formats(fd: int) -> list[int]:
-    return [r.pixelformat for r in _rows(fd, ENUM_FMT, lambda i: _Format(index=i, type=_BUF_TYPE_VIDEO_CAPTURE))]
+    rows = _rows(fd, ENUM_FMT, lambda i: _Format(index=i, type=_BUF_TYPE_VIDEO_CAPTURE))
+    return tuple(fourcc_text(row.pixelformat) for row in rows)
 
 
 def _rows(fd: int, request: int, row_of: Callable[[int], Any]) -> Iterator[Any]:

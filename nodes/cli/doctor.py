@@ -21,12 +21,12 @@ def doctor(
     output: JsonOutput,
     *,
     cameras: bool = False,  # list the cameras that are connected instead, as a config names them
-    kind: list[str] | None = None,  # --cameras: only this kind (v4l2, stereo, oak, realsense); may be repeated
+    kind: list[str] | None = None,  # --cameras: only this kind (v4l2, oak, realsense); may be repeated
 ) -> int:
     """Say what this machine lacks, and the fix; list its cameras.
 
-    Exit code 1 where something needed is missing. Video files and streams (kind opencv) are named, not found. A kind of
-    camera whose packages are missing is reported, too.
+    Exit code 1 where something needed is missing. Video files, streams (kind opencv) and pairs (kind stereo) are named,
+    not found. A kind of camera whose packages are missing is reported, too.
 
     Example: semantic-mapper doctor
     Example: semantic-mapper doctor --cameras --kind v4l2 --json

@@ -97,8 +97,6 @@ class Machine:
             told.capabilities, told.device_caps = 0x80000000 | CAPTURE | METADATA, sensor.capabilities
         elif request == ioctls.ENUM_FMT and told.index < len(sensor.formats):
             told.pixelformat = cv2.VideoWriter.fourcc(*sensor.formats[told.index])
-        elif request == ioctls.ENUM_FRAMESIZES and told.index < len(sensor.sizes):
-            told.type, told.size[0], told.size[1] = 1, *sensor.sizes[told.index]
         elif request == ioctls.QUERYCTRL and (later := [i for i in sorted(controls) if i > told.id & 0x7FFFFFFF]):
             c = controls[later[0]]
             told.id, told.name = c.id, c.name.replace("_", " ").title().encode()

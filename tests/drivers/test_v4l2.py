@@ -38,7 +38,6 @@ def image_where(images: Iterator[CameraImage], holds: Callable[[CameraImage], bo
 def test_requests_are_those_of_the_kernel_s_header() -> None:
     assert (ioctls.QUERYCAP, ioctls.ENUM_FMT) == (0x80685600, 0xC0405602)
     assert (ioctls.G_CTRL, ioctls.S_CTRL, ioctls.QUERYCTRL) == (0xC008561B, 0xC008561C, 0xC0445624)
-    assert ioctls.ENUM_FRAMESIZES == 0xC02C564A
 
 
 def test_images_are_rgb_with_the_stamps_of_their_buffers(machine: Machine, tmp_path: Path) -> None:

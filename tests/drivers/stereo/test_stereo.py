@@ -16,7 +16,6 @@ from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibration import StereoCalibration, load_stereo, save_stereo
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.depth import StereoDepth
-from semantic_mapper.drivers.v4l2.devices import list_stereo
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine
@@ -148,7 +147,7 @@ def test_a_file_of_a_pair_reads_back_to_the_same_numbers_and_swapped_halves_are_
 @pytest.mark.parametrize(
     ("settings", "error", "complaint"),
     [
-        ({"device": ""}, CameraError, "no device is named; `doctor --cameras --kind stereo`"),
+        ({"device": ""}, CameraError, "no device is named; `doctor --cameras`"),
         ({"calibration": ""}, CameraError, "has no calibration; make one with `semantic-mapper calibrate --stereo`"),
         ({"calibration": "lens.toml"}, ConfigError, "lens.toml: .*calibrate --stereo` makes the file of a pair"),
         ({"min_depth_m": 0.05}, ConfigError, r"min_depth_m = 0.05 is too near for this pair: .* 0\.\d\d m is possible"),
@@ -188,12 +187,3 @@ def test_a_pair_of_a_webcam_is_read_without_its_rectification(machine: Machine, 
         image = next(iter(camera))
         assert image.rgb.shape == (360, 480, 3) and image.depth_m is not None and not image.depth_m.any()
         assert camera.warnings == () and not camera.can_wait
-
-
-def test_cameras_that_offer_images_side_by_side_are_listed(machine: Machine) -> None:
-    machine.plug(Sensor(), 0)
-    link = machine.plug(Sensor(card="Pair", sizes=((2560, 720), (1280, 720))), 1, link="usb-Pair-video-index0")
-    machine.plug(Sensor(answers=False), 2, link="")
-    (found,) = list_stereo()
-    assert (found.kind, found.name, found.address) == ("stereo", "Pair", str(link))
-    assert found.note == "video1; side by side 2560x720"
