@@ -36,7 +36,6 @@ class SweepResult(NamedTuple):
     path_sum: UInt16  # (h, w, D) uint16 the same, summed along paths
     plane: Float32  # (h, w) float32 best plane, between planes
     confidence: Float32  # (h, w) float32 in [0, 1], how much the next best plane costs above it
-    match: Float32  # (h, w) float32 matching cost of the best plane
     seen: UInt8  # (h, w) uint8 the most sources that see one plane of the pixel
 
 
@@ -64,9 +63,9 @@ def sweep_and_match(
     total = np.empty((PATH_GROUPS, *volume), np.uint16)
     states = np.empty((PATH_GROUPS, 2 * (6 * width + 1) * (volume[2] + 4)), np.uint8)
     sum_paths(PATH_GROUPS, cost, reference.gray, _LARGE_STEPS, total, states, SMALL_STEP)
-    plane, confidence, match = (np.empty((height, width), np.float32) for _ in range(3))
-    pick_planes(height, total, cost, plane, confidence, match)
-    return SweepResult(cost, total[0], plane, confidence, match, seen)
+    plane, confidence = (np.empty((height, width), np.float32) for _ in range(2))
+    pick_planes(height, total, plane, confidence)
+    return SweepResult(cost, total[0], plane, confidence, seen)
 
 
 def relative_projections(
@@ -141,6 +140,6 @@ def sum_paths(
 
 
 @parallel_kernel()
-def pick_planes(count: int, path_sum: UInt16, cost: UInt8, plane: Float32, confidence: Float32, match: Float32) -> None:
-    """Lowest plane of each pixel with a parabola through its neighbours: writes ``plane``, ``confidence`` and ``match``
-    of `SweepResult`; the first of ``path_sum`` (3, h, w, D) becomes the sum of all three."""
+def pick_planes(count: int, path_sum: UInt16, plane: Float32, confidence: Float32) -> None:
+    """Lowest plane of each pixel with a parabola through its neighbours: writes ``plane`` and ``confidence`` of
+    `SweepResult`; the first of ``path_sum`` (3, h, w, D) becomes the sum of all three."""

@@ -13,9 +13,6 @@ from semantic_mapper.imaging import working_intrinsics
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, PosedFrame, UInt8
 
-SAME_SURFACE = 0.05  # fraction of the depth by which neighbouring pixels of one surface differ at most
-COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
-
 
 class DepthEstimate(NamedTuple):
     """Depth of a view."""
@@ -81,7 +78,7 @@ def enlarge_estimate(estimate: DepthEstimate, coarse_rgb: UInt8, rgb: UInt8) -> 
     full = DepthEstimate(np.zeros(rgb.shape[:2], np.float32), np.zeros(rgb.shape[:2], np.float32))
     depth_m, sigma_m = np.ascontiguousarray(estimate.depth_m), np.ascontiguousarray(estimate.sigma_m)
     images = np.ascontiguousarray(coarse_rgb), np.ascontiguousarray(rgb)
-    enlarge_depth(len(rgb), depth_m, sigma_m, *images, *full, SAME_SURFACE, COLOUR_RATE)
+    enlarge_depth(len(rgb), depth_m, sigma_m, *images, *full)
     return full
 
 
@@ -92,17 +89,6 @@ def compare_with_middle(count: int, padded: UInt8, census: Int32, spacing: int) 
 
 @parallel_kernel()
 def enlarge_depth(
-    count: int,
-    depth: Float32,
-    sigma: Float32,
-    coarse_rgb: UInt8,
-    rgb: UInt8,
-    out_depth: Float32,
-    out_sigma: Float32,
-    same: float,
-    colour_rate: float,
+    count: int, depth: Float32, sigma: Float32, coarse_rgb: UInt8, rgb: UInt8, out_depth: Float32, out_sigma: Float32
 ) -> None:
-    """The upsampling of `enlarge_estimate`: writes ``out_depth`` and ``out_sigma`` (H, W), zeros before.
-
-    A coarse pixel counts by exp(-colour_rate * squared distance of the colours).
-    """
+    """The upsampling of `enlarge_estimate`: writes ``out_depth`` and ``out_sigma`` (H, W), zeros before."""

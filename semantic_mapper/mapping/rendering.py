@@ -31,11 +31,6 @@ LEAST_SHARE = 0.1  # of the pixels; below, samples go first
 RESERVE = 0.9  # of a frame's time is planned for: frames differ
 MEMORY = 0.7  # of what was known stays when a new frame is measured
 
-COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
-DEPTH_SIGMA = 0.02  # fraction of z
-LARGEST_STEP = 8.0  # a depth that differs by more counts no more: then colour decides among the rest
-LEAST_WEIGHT = 1e-9  # where nothing looks alike, the coarse pixels still count alike
-
 
 class RenderedView(NamedTuple):
     """What a field says of a view. ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its
@@ -177,8 +172,7 @@ def upsample(
     find_one_class(len(channel), channel, one_class)
     table = np.ascontiguousarray(probabilities.reshape(-1, probabilities.shape[2]))
     images = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
-    weights = COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT
-    upsample_view(len(depth), table, channel, one_class, look, *images, out, *weights)
+    upsample_view(len(depth), table, channel, one_class, look, *images, out)
     return out
 
 
@@ -197,9 +191,5 @@ def upsample_view(
     rgb: UInt8,
     depth: Float32,
     out: Int32,
-    colour_rate: float,
-    depth_sigma: float,
-    largest_step: float,
-    least_weight: float,
 ) -> None:
     """``upsample`` of ``count`` rows; ``look`` (h, w, 4) is colour and depth of the coarse pixels."""

@@ -237,14 +237,12 @@ KERNEL(sum_paths, PathArguments) {
 
 typedef struct {
     U16 sum;        /* (3, h, w, D), of which the first becomes the sum of all three */
-    U8 cost;        /* (h, w, D) */
     F32 plane;      /* (h, w) lowest, between planes */
     F32 confidence; /* (h, w) 0 to 1: how much the next best, two planes away or more, costs above it */
-    F32 match;      /* (h, w) cost of the best plane itself */
 } PickArguments;
 
 KERNEL(pick_planes, PickArguments) {
-    const int64_t width = a->cost.shape[1], planes = a->cost.shape[2], volume = a->cost.shape[0] * width * planes;
+    const int64_t width = a->sum.shape[2], planes = a->sum.shape[3], volume = a->sum.shape[1] * width * planes;
     for (int64_t at = start * width; at < stop * width; at++) {
         uint16_t *s = a->sum.data + at * planes;
         const uint16_t *t = s + volume, *u = t + volume;
@@ -262,7 +260,6 @@ KERNEL(pick_planes, PickArguments) {
         }
         a->plane.data[at] = (float)best + offset;
         a->confidence.data[at] = next > 0 ? (float)(next - s[best]) / (float)next : 0.0f;
-        a->match.data[at] = (float)a->cost.data[at * planes + best];
     }
     return 0;
 }
@@ -313,9 +310,11 @@ typedef struct {
     U8 coarse_rgb;            /* (h, w, 3) */
     U8 rgb;                   /* (H, W, 3) */
     F32 out_depth, out_sigma; /* (H, W) */
-    double same;              /* fraction of the depth by which pixels of one surface differ at most */
-    double colour_rate;       /* a coarse pixel counts by about exp(-rate * squared distance of the colours) */
 } EnlargeArguments;
+
+#define SAME_SURFACE 0.05f /* fraction of the depth by which pixels of one surface differ at most */
+/* A coarse pixel counts by about exp(-rate * squared distance of the colours): sigma of 20 8-bit steps. */
+#define COLOUR_RATE (1.0f / (2 * 20 * 20))
 
 /* Depth of a full pixel: of the coarse pixels round it, those of the surface that looks most like it, averaged. */
 static void enlarge_pixel(const EnlargeArguments *a, int64_t v, int64_t u, float y, float x) {
@@ -333,19 +332,19 @@ static void enlarge_pixel(const EnlargeArguments *a, int64_t v, int64_t u, float
             for (int c = 0; c < 3; c++) distance += (float)((other[c] - colour[c]) * (other[c] - colour[c]));
             const float dy = y - (float)j, dx = x - (float)i;
             z[count] = a->depth.data[from], sigma[count] = a->sigma.data[from];
-            const float near = 1.0f / (1.0f + 0.25f * ((float)a->colour_rate * distance + 0.7f * (dy * dy + dx * dx)));
+            const float near = 1.0f / (1.0f + 0.25f * (COLOUR_RATE * distance + 0.7f * (dy * dy + dx * dx)));
             weight[count++] = near * near * near * near; /* about exp of the negative sum */
         }
     if (!count) return; /* none stays 0 */
     for (int k = 0; k < count; k++) {
         float support = 0;
         for (int m = 0; m < count; m++)
-            if (fabsf(z[m] - z[k]) < (float)a->same * z[k]) support += weight[m];
+            if (fabsf(z[m] - z[k]) < SAME_SURFACE * z[k]) support += weight[m];
         if (support > best) best = support, chosen = k;
     }
     float sum = 0, spread = 0, total = 0;
     for (int m = 0; m < count; m++)
-        if (fabsf(z[m] - z[chosen]) < (float)a->same * z[chosen])
+        if (fabsf(z[m] - z[chosen]) < SAME_SURFACE * z[chosen])
             sum += weight[m] / z[m], spread += weight[m] * sigma[m], total += weight[m];
     a->out_depth.data[at] = total / sum, a->out_sigma.data[at] = spread / total;
 }
@@ -363,7 +362,7 @@ KERNEL(enlarge_depth, EnlargeArguments) {
             const float *z = a->depth.data + j * width + i, *sigma = a->sigma.data + j * width + i;
             const float low = min_f(min_f(z[0], z[beside]), min_f(z[below], z[below + beside]));
             const float high = max_f(max_f(z[0], z[beside]), max_f(z[below], z[below + beside]));
-            if (!(low > 0) || high - low > (float)a->same * low) {
+            if (!(low > 0) || high - low > SAME_SURFACE * low) {
                 enlarge_pixel(a, v, u, y, x);
                 continue;
             }

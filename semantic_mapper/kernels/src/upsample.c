@@ -31,8 +31,12 @@ typedef struct {
     U8 rgb;            /* (H, W, 3) */
     F32 depth;         /* (H, W) */
     I32 out;           /* (H, W) */
-    double colour_rate, depth_sigma, largest_step, least_weight;
 } UpsampleArguments;
+
+#define COLOUR_RATE (1.0f / (2 * 20 * 20)) /* sigma of 20 8-bit steps */
+#define DEPTH_RATE 50.0f                   /* sigma of 2 % of z */
+#define LARGEST_STEP 8.0f  /* a depth that differs by more counts no more: then colour decides among the rest */
+#define LEAST_WEIGHT 1e-9f /* where nothing looks alike, the coarse pixels still count alike */
 
 /* The coarse pixels round one full pixel. */
 typedef struct {
@@ -80,7 +84,6 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
     const int64_t height = a->channel.shape[0], width = a->channel.shape[1], columns = a->depth.shape[1];
     const float scale_y = (float)((double)height / (double)a->depth.shape[0]);
     const float scale_x = (float)((double)width / (double)columns);
-    const float colour_rate = (float)a->colour_rate, largest_step = (float)a->largest_step;
     const float y = ((float)v + 0.5f) * scale_y - 0.5f;
     const int64_t j0 = min_i(max_i((int64_t)floorf(y + 0.5f), 0), height - 1);
     for (int64_t u = 0; u < columns; u++) {
@@ -91,7 +94,7 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
             continue;
         }
         const uint8_t *rgb = a->rgb.data + 3 * at;
-        const float z = a->depth.data[at], depth_rate = z > 0 ? (float)(1.0 / a->depth_sigma) / z : 0.0f;
+        const float z = a->depth.data[at], depth_rate = z > 0 ? DEPTH_RATE / z : 0.0f;
         Taps taps;
         taps.count = 0;
         for (int64_t j = max_i(j0 - 1, 0); j < min_i(j0 + 2, height); j++)
@@ -101,10 +104,10 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
                 const float *look = a->look.data + 4 * from, dy = y - (float)j, dx = x - (float)i;
                 const float r = rgb[0] - look[0], g = rgb[1] - look[1], b = rgb[2] - look[2];
                 const float step = (z - look[3]) * depth_rate;
-                float cost = (r * r + g * g + b * b) * colour_rate + dy * dy + dx * dx;
-                if (look[3] > 0) cost += min_f(step * step, largest_step);
+                float cost = (r * r + g * g + b * b) * COLOUR_RATE + dy * dy + dx * dx;
+                if (look[3] > 0) cost += min_f(step * step, LARGEST_STEP);
                 taps.index[taps.count] = from, taps.channel[taps.count] = a->channel.data[from];
-                taps.weight[taps.count++] = fast_exp(-cost) + (float)a->least_weight;
+                taps.weight[taps.count++] = fast_exp(-cost) + LEAST_WEIGHT;
             }
         a->out.data[at] = (int32_t)nearest_of_class(&taps, &a->probabilities);
     }
