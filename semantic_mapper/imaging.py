@@ -15,10 +15,6 @@ from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import MAX_DEPTH_M, MIN_DEPTH_M, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 REACH = 1 / 32  # of the image's width is looked at to either side: sensors err by their own pixels, not by ours
-# A leap from one surface to another, as wide as the guided interval: fraction of z, and metres
-SURFACE_STEP, SURFACE_STEP_M = 0.04, 0.08
-COLOUR_SIGMA = 12.0  # 8-bit steps
-ADVANTAGE = 1.5  # times as much must the other surface count for a pixel to go over to it
 
 
 def working_intrinsics(intrinsics: CameraIntrinsics, width: int) -> CameraIntrinsics:
@@ -140,34 +136,13 @@ def depth_prior(depth_m: Float32, rgb: UInt8) -> Float32:
     expect_shape(rgb, f"{sizes['H']} {sizes['W']} 3", "rgb")
     filled = np.ascontiguousarray(fill_holes(depth_m), np.float32)
     out = np.empty_like(filled)
-    draw_borders_to_edges(
-        len(filled),
-        filled,
-        np.ascontiguousarray(depth_m, np.float32),
-        np.ascontiguousarray(rgb),
-        out,
-        max(round(REACH * sizes["W"]), 1),
-        SURFACE_STEP,
-        SURFACE_STEP_M,
-        1 / (2 * COLOUR_SIGMA**2),
-        ADVANTAGE,
-    )
+    images = filled, np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(rgb)
+    draw_borders_to_edges(len(filled), *images, out, max(round(REACH * sizes["W"]), 1))
     return out
 
 
 @parallel_kernel()
-def draw_borders_to_edges(
-    count: int,
-    filled: Float32,
-    measured: Float32,
-    rgb: UInt8,
-    out: Float32,
-    reach: int,
-    step: float,
-    step_m: float,
-    colour_rate: float,
-    advantage: float,
-) -> None:
+def draw_borders_to_edges(count: int, filled: Float32, measured: Float32, rgb: UInt8, out: Float32, reach: int) -> None:
     """The filter of ``depth_prior``: ``count`` rows, from depth without holes and with, (H, W) each, into ``out``."""
 
 

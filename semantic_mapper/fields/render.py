@@ -27,9 +27,6 @@ CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache
 GPU_CHUNK = 32768  # enough to fill one, as long as
 GPU_PAIRS = GPU_CHUNK * 16**2  # pairs of samples that attend to each other are no more: 1 GB of scores for 8 views
 COARSEST = 4  # pixels between the first rays, a power of two
-DEPTH_STEP = 0.03  # fraction of z by which the depth prior leaves the plane through its neighbours across a border
-COLOUR_STEP = 40.0  # 8-bit steps, summed over the channels, by which a colour differs from its neighbours' at an edge
-UNSURE = 0.2  # probability that is not the likeliest class's, above which agreeing rays do not tell enough
 
 
 def chunk_size(rays_per_chunk: int, device: torch.device, sampling: SamplingConfig) -> int:
@@ -121,8 +118,8 @@ def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32
     while step > 1:
         uncertainty = np.zeros((height, width), np.float32)
         half = step // 2
-        images = (probabilities, known, depth_m, prior_depth_m, rgb, uncertainty)
-        fill_between_rays((height + half - 1) // half, step, *images, DEPTH_STEP, COLOUR_STEP, UNSURE)
+        rows = (height + half - 1) // half
+        fill_between_rays(rows, step, probabilities, known, depth_m, prior_depth_m, rgb, uncertainty)
         flat = np.flatnonzero(uncertainty)
         left = max(int(fraction * height * width) - traced, 0)
         if len(flat) > left:
@@ -142,9 +139,6 @@ def fill_between_rays(
     prior: Float32,
     rgb: UInt8,
     uncertainty: Float32,
-    depth_step: float,
-    colour_step: float,
-    unsure: float,
 ) -> None:
     """Give pixels half way between those of a grid (``step`` apart) the mean of the known grid pixels round them, in
     ``count`` rows half a step apart; ``uncertainty`` (H, W) gets how little the grid says of such a pixel."""

@@ -8,10 +8,12 @@ typedef struct {
     U8 rgb;               /* (H, W, 3) */
     F32 out;              /* (H, W) */
     int64_t reach;        /* pixels to either side */
-    double step, step_m;  /* two surfaces are farther apart than step * z + step_m */
-    double colour_rate;   /* a neighbour counts by exp(-rate * squared distance of the colours) */
-    double advantage;     /* how much more the other surface must count for a pixel to go over to it */
 } DrawArguments;
+
+#define STEP 0.04 /* two surfaces are farther apart than STEP * z + STEP_M, as wide as the guided interval */
+#define STEP_M 0.08
+#define COLOUR_RATE (1 / (2 * 12.0 * 12.0)) /* a neighbour's colour counts with a sigma of 12 8-bit steps */
+#define ADVANTAGE 1.5 /* times as much must the other surface count for a pixel to go over to it */
 
 typedef struct {
     int64_t left, right, top, bottom;
@@ -33,17 +35,17 @@ static float choose_surface(const DrawArguments *a, const Window *w, int64_t pix
                 const double difference = (double)a->rgb.data[3 * other + c] - (double)colour[c];
                 distance += difference * difference;
             }
-            const double weight = exp(-a->colour_rate * distance);
+            const double weight = exp(-COLOUR_RATE * distance);
             const int side = z > middle;
             count[side] += weight, sum[side] += weight * (double)z;
         }
     const int here = own > middle, there = 1 - here;
-    const bool goes_over = count[there] > a->advantage * count[here] + 1e-3;
+    const bool goes_over = count[there] > ADVANTAGE * count[here] + 1e-3;
     return goes_over ? (float)(sum[there] / count[there]) : own;
 }
 
-static bool apart(const DrawArguments *a, float one, float other) {
-    return (double)fabsf(one - other) > a->step * (double)min_f(one, other) + a->step_m;
+static bool apart(float one, float other) {
+    return (double)fabsf(one - other) > STEP * (double)min_f(one, other) + STEP_M;
 }
 
 /* Whether depth leaps from one pixel to the next somewhere in the window: on a slanted surface it climbs. */
@@ -52,8 +54,8 @@ static bool has_leap(const DrawArguments *a, const Window *w) {
     for (int64_t y = w->top; y < w->bottom; y++)
         for (int64_t x = w->left; x < w->right; x++) {
             const float *z = a->filled.data + y * width + x;
-            if (x + 1 < w->right && apart(a, z[0], z[1])) return true;
-            if (y + 1 < w->bottom && apart(a, z[0], z[width])) return true;
+            if (x + 1 < w->right && apart(z[0], z[1])) return true;
+            if (y + 1 < w->bottom && apart(z[0], z[width])) return true;
         }
     return false;
 }
@@ -72,7 +74,7 @@ KERNEL(draw_borders_to_edges, DrawArguments) {
                     const float z = a->filled.data[y * width + x];
                     low = min_f(low, z), high = max_f(high, z);
                 }
-            const bool two = apart(a, low, high) && has_leap(a, &w);
+            const bool two = apart(low, high) && has_leap(a, &w);
             a->out.data[pixel] = two ? choose_surface(a, &w, pixel, low, high) : own;
         }
     return 0;

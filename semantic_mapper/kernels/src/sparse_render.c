@@ -10,8 +10,11 @@ typedef struct {
     F32 depth, prior;  /* (H, W) metres: rendered, and the prior of the rays */
     U8 rgb;            /* (H, W, 3) */
     F32 uncertainty;   /* (H, W) */
-    double depth_step, colour_step, unsure;
 } FillArguments;
+
+#define DEPTH_STEP 0.03  /* fraction of z by which the prior leaves the plane through its neighbours across a border */
+#define COLOUR_STEP 40.0 /* 8-bit steps, summed over the channels, by which a colour differs at an edge */
+#define UNSURE 0.2 /* probability that is not the likeliest class's, above which agreeing rays do not tell enough */
 
 /* One pixel: the mean of the known ones among the four grid pixels round it. */
 static void fill_pixel(const FillArguments *a, int64_t v, int64_t u) {
@@ -48,10 +51,10 @@ static void fill_pixel(const FillArguments *a, int64_t v, int64_t u) {
         }
     }
     const double prior = a->prior.data[at], unsure = 1 - (double)best;
-    const bool jump = fabs((double)prior_sum / 4 - prior) > a->depth_step * prior;
+    const bool jump = fabs((double)prior_sum / 4 - prior) > DEPTH_STEP * prior;
     double edge = 0;
     for (int c = 0; c < 3; c++) edge += fabs((double)colour_sum[c] / 4 - a->rgb.data[3 * at + c]);
-    if (differs || jump || edge > a->colour_step || unsure > a->unsure)
+    if (differs || jump || edge > COLOUR_STEP || unsure > UNSURE)
         a->uncertainty.data[at] = (float)((differs ? 2.0 : 0.0) + (jump ? 1.0 : 0.0) + min_d(edge / 255, 1.0) + unsure);
 }
 
