@@ -10,7 +10,9 @@ from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -47,3 +49,9 @@ def tiny_config(**changes: object) -> MapperConfig:
     voxel_map = {"voxel_size_m": 0.05, "unknown_below": 0.0}
     base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": voxel_map}
     return convert_config({**base, **changes}, MapperConfig, "test config")
+
+
+def tiny_pipeline(**changes: object) -> MappingPipeline:
+    """A pipeline of ``tiny_config`` and ``tiny_field``."""
+    config = tiny_config(**changes)
+    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)

@@ -20,7 +20,7 @@ from semantic_mapper.mapping.correction import ALWAYS, PoseCorrection, PosePair
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
-from tests.small import tiny_config, tiny_field, tiny_frames
+from tests.small import tiny_field, tiny_frames, tiny_pipeline
 
 
 def make_pipeline(max_frames: int = 100, **changes: object) -> MappingPipeline:
@@ -29,8 +29,7 @@ def make_pipeline(max_frames: int = 100, **changes: object) -> MappingPipeline:
         "keyframes": {"source_views": 2, "translation_m": 0.1},
         "history": {"max_frames": max_frames},
     }
-    config = tiny_config(**{**base, **changes})
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{**base, **changes})
 
 
 def mapped(frames: list[PosedFrame] | tuple[PosedFrame, ...], **changes: object) -> MappingPipeline:

@@ -16,7 +16,6 @@ from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.frame_depth import (
@@ -32,7 +31,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.rendered_views import frame as posed
 from tests.mapping.rendered_views import plane_depth, small_map
-from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_field
+from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_pipeline
 
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
 FINE = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
@@ -49,8 +48,7 @@ def without_depth(frames: Sequence[PosedFrame]) -> list[PosedFrame]:
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
 
 
 def mapped(frames: Sequence[PosedFrame], **changes: object) -> MappingPipeline:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
@@ -19,7 +18,8 @@ from semantic_mapper.mapping.moving import (
 )
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, PosedFrame
-from tests.small import tiny_config, tiny_field
+from tests.mapping.test_voxel_map import same
+from tests.small import tiny_config, tiny_pipeline
 
 CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
 WALL_M, POLE_M, THING_M = 3.0, 2.2, 1.8
@@ -107,8 +107,7 @@ def test_poses_that_are_off_are_put_right_or_known_to_be_wrong(sigma_m: float, s
 
 
 def pipeline(**moving: bool) -> MappingPipeline:
-    config = tiny_config(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
 
 
 VOXELS = {"voxel_size_m": 0.05, "clear_free_space": False}
@@ -132,8 +131,7 @@ def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
     on.corrector.start({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
     while not on.corrector.advance(4):
         pass
-    after = on.voxel_map.block_state()
-    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert same(on.voxel_map.block_state(), before)
 
 
 def test_where_it_moved_is_kept_for_a_second() -> None:

@@ -15,22 +15,13 @@ from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
 from semantic_mapper.types import PosedFrame
-from tests.small import tiny_config, tiny_field, tiny_frames
-
-
-def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**changes)
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
-
-
-def same_map(a: MappingPipeline, b: MappingPipeline) -> bool:
-    x, y = a.voxel_map.block_state(), b.voxel_map.block_state()
-    return all(np.array_equal(x[k], y[k]) for k in x)
+from tests.mapping.test_voxel_map import same
+from tests.small import tiny_config, tiny_field, tiny_frames, tiny_pipeline
 
 
 @pytest.mark.parametrize("value", [1e-40, 1e4, 1e30, 3.4e38, np.inf, np.nan, -1.0])
 def test_depth_that_no_sensor_measures_counts_as_none(value: float):
-    hostile, blank = make_pipeline(), make_pipeline()
+    hostile, blank = tiny_pipeline(), tiny_pipeline()
     for number, frame in enumerate(tiny_frames(3)):
         assert frame.depth_m is not None
         wild, none = frame.depth_m.copy(), frame.depth_m.copy()
@@ -38,11 +29,11 @@ def test_depth_that_no_sensor_measures_counts_as_none(value: float):
         wild[part], none[part] = value, 0
         hostile.step(replace(frame, depth_m=wild))
         blank.step(replace(frame, depth_m=none))
-    assert same_map(hostile, blank)
+    assert same(hostile.voxel_map.block_state(), blank.voxel_map.block_state())
 
 
 def test_bad_frames_are_refused_and_leave_the_map_as_it_was():
-    a, b = make_pipeline(), make_pipeline()
+    a, b = tiny_pipeline(), tiny_pipeline()
     good = tiny_frames()
     nan_pose, mirrored = good[1].T_world_camera.copy(), good[1].T_world_camera.copy()
     nan_pose[0, 3] = np.nan
@@ -56,12 +47,12 @@ def test_bad_frames_are_refused_and_leave_the_map_as_it_was():
     for frame in good[1:3]:
         a.step(frame)
         b.step(frame)
-    assert same_map(a, b)
+    assert same(a.voxel_map.block_state(), b.voxel_map.block_state())
 
 
 def test_cameras_of_two_sizes_have_each_their_own_keyframes():
     """At one place both become keyframes, and each is rendered from views of its own size."""
-    pipeline = make_pipeline(keyframes={"translation_m": 0.02})
+    pipeline = tiny_pipeline(keyframes={"translation_m": 0.02})
 
     def narrow(frame: PosedFrame, seq: int) -> PosedFrame:
         intrinsics = replace(
@@ -81,7 +72,7 @@ def test_cameras_of_two_sizes_have_each_their_own_keyframes():
 
 def test_frames_without_depth_are_rendered_and_fused_from_what_the_field_sees():
     # Untrained weights guess the depth of a view without depth at random, so only views with depth are sources here.
-    pipeline = make_pipeline(keyframes={"use_current_view": False, "translation_m": 0.02}, depth={"source": "sensor"})
+    pipeline = tiny_pipeline(keyframes={"use_current_view": False, "translation_m": 0.02}, depth={"source": "sensor"})
     frames = tiny_frames()
     for frame in frames[:3]:
         pipeline.step(frame)
@@ -114,9 +105,8 @@ def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
         rays.append(field.rays)
         pipelines.append(pipeline)
     assert rays[1] < 0.6 * rays[0]
-    same = np.mean([(a.label == b.label).mean() for a, b in zip(updates[0], updates[1], strict=True)])
-    assert same > 0.9
-    assert same_map(pipelines[1], pipelines[2])
+    assert np.mean([(a.label == b.label).mean() for a, b in zip(updates[0], updates[1], strict=True)]) > 0.9
+    assert same(pipelines[1].voxel_map.block_state(), pipelines[2].voxel_map.block_state())
 
 
 def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
@@ -133,8 +123,8 @@ def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
         for frame in stream:
             pipeline.step(frame)
         maps.append(pipeline)
-    assert not same_map(maps[0], maps[1])
-    assert same_map(maps[0], maps[2])
+    assert not same(maps[0].voxel_map.block_state(), maps[1].voxel_map.block_state())
+    assert same(maps[0].voxel_map.block_state(), maps[2].voxel_map.block_state())
 
 
 class SceneField(GridField):
@@ -170,7 +160,7 @@ FRAMES = tiny_frames(6)
 
 
 def mapped(count: int = 4) -> MappingPipeline:
-    pipeline = MappingPipeline(tiny_config(keyframes={"translation_m": 0.01}), StreamingSRay(tiny_field()), ROOMS)
+    pipeline = tiny_pipeline(keyframes={"translation_m": 0.01})
     for frame in FRAMES[:count]:
         pipeline.step(dataclasses.replace(frame, label=None))
     return pipeline
@@ -182,19 +172,18 @@ def test_an_exchanged_field_goes_on_with_map_and_keyframes_as_they_are(monkeypat
     before, keyframes = pipeline.voxel_map.block_state(), pipeline.keyframes.keyframes
     assert len(keyframes) == 4
     anchors = [FRAMES[4], FRAMES[5]]
-    same = FieldTrial(pipeline, StreamingSRay(tiny_field()), (), [FRAMES[0], FRAMES[1]])
-    assert [same.advance() for _ in range(2)] == [False, True]
+    alike = FieldTrial(pipeline, StreamingSRay(tiny_field()), (), [FRAMES[0], FRAMES[1]])
+    assert [alike.advance() for _ in range(2)] == [False, True]
     trial = FieldTrial(pipeline, StreamingSRay(tiny_field()), anchors, [FRAMES[0], FRAMES[1]])
     assert [trial.advance() for _ in range(4)] == [False, False, False, True]
     # What the map says comes from the same random weights; those that know labels of two views say otherwise.
-    assert same.agreement is not None and trial.agreement is not None and same.agreement > 2 * trial.agreement
+    assert alike.agreement is not None and trial.agreement is not None and alike.agreement > 2 * trial.agreement
     assert pipeline.keyframes.keyframes == keyframes  # a trial changes nothing
     trial.exchange()
     kept = pipeline.keyframes.keyframes
     assert [k.labelled for k in kept] == [True, True, False, False, False, False]
     assert kept[2:] == keyframes and (kept[0].encoded.channel >= 0).any()
-    after = pipeline.voxel_map.block_state()
-    assert all(np.array_equal(after[name], before[name]) for name in before)
+    assert same(pipeline.voxel_map.block_state(), before)
     update = pipeline.step(dataclasses.replace(FRAMES[4], label=None))
     assert update.fused and {4, 5} & set(update.source_seqs)
     trial = FieldTrial(pipeline, StreamingSRay(tiny_field()), anchors[:1], [])
@@ -215,7 +204,7 @@ def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ):
     monkeypatch.setattr("semantic_mapper.mapping.allocation.LEAST_FRAME_BUDGET", 400)
-    a, b = (make_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
+    a, b = (tiny_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
     good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
     noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))
     a.step(good)
@@ -224,4 +213,4 @@ def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
     a.step(replace(good, seq=2))
     b.step(good)
     b.step(replace(good, seq=2))
-    assert same_map(a, b)
+    assert same(a.voxel_map.block_state(), b.voxel_map.block_state())

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose, transform
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.virtual_views import MARGIN_M, VOTE_WEIGHT, ViewpointChooser, add_votes, surface_patches
@@ -14,7 +12,8 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map
 from tests.mapping.test_keyframes import WALL, keyframe, pose
-from tests.small import tiny_config, tiny_field, tiny_frames
+from tests.mapping.test_voxel_map import same
+from tests.small import tiny_frames, tiny_pipeline
 
 WALL_Z = 2.0
 GEOMETRY = ("keys", "tsdf", "weight", "color")
@@ -99,13 +98,11 @@ def test_no_block_is_made_where_the_map_has_none():
     made = wall_map(0)
     before = made.block_state()
     assert vote(made, np.full((INTRINSICS.height, INTRINSICS.width), 1.0, np.float32)) == 0
-    after = made.block_state()
-    assert all(np.array_equal(after[k], before[k]) for k in before) and made.version == 1
+    assert same(made.block_state(), before) and made.version == 1
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**{"keyframes": {"translation_m": 0.02}, **changes})
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{"keyframes": {"translation_m": 0.02}, **changes})
 
 
 def half_mapped(**changes: object) -> MappingPipeline:
@@ -130,8 +127,7 @@ def test_looking_around_gives_votes_to_surface_without_any_and_repeats_to_the_bi
     assert ((votes > 0) & (state["votes"] == 0)).sum() > 100
     for _ in range(3):
         b.render_virtual_view()
-    x, y = a.voxel_map.block_state(), b.voxel_map.block_state()
-    assert all(x[k].tobytes() == y[k].tobytes() for k in x)
+    assert same(a.voxel_map.block_state(), b.voxel_map.block_state())
 
 
 def test_steps_render_virtual_views_only_where_they_are_told_to():
@@ -152,5 +148,4 @@ def test_a_correction_rebuilds_the_map_without_virtual_votes():
     pipeline.corrector.start({stepped[0].stamp_ns: stepped[0].T_world_camera})
     while pipeline.corrector.advance(3):
         pass
-    x, y = pipeline.voxel_map.block_state(), silent.voxel_map.block_state()
-    assert all(x[k].tobytes() == y[k].tobytes() for k in x)
+    assert same(pipeline.voxel_map.block_state(), silent.voxel_map.block_state())
