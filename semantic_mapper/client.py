@@ -111,8 +111,8 @@ class MapClient(Closing):
     def instances(self, up: ArrayLike = UP, *, gone: bool = False, unsure: bool = False) -> tuple[Instance, ...]:
         """Things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
 
-        With ``unsure``, also those that are more likely stray pieces. With ``gone``, behind
-        them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest 64.
+        With ``unsure``, also those of low certainty. With ``gone``, behind them also those of earlier answers that
+        have gone since (``Instance.gone_ns``), the latest 64.
         """
         return self._ask(questions.InstancesRequest(up=_point(up, "up"), gone=gone, unsure=unsure))
 

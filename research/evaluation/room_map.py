@@ -246,19 +246,22 @@ def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceReco
     return InstanceRecord(found=found, truth=matches.truth)
 
 
-def match_things(voxel_map: VoxelMap, surface: TrueSurface) -> tuple[tuple[Instance, ...], InstanceMatches]:
-    """The things that queries find in a map, unsure ones, too, and each against those of the true surface, at the map's
-    surface voxels."""
-    seen = ThingSurface(voxel_map, up=UP)
+def match_things(
+    voxel_map: VoxelMap, surface: TrueSurface, labels: LabelSet = ROOMS, up: Float64 = UP
+) -> tuple[tuple[Instance, ...], InstanceMatches]:
+    """The things that queries find in a map, unsure ones, too, and each against those of the true surface, ids of
+    ``labels``, at the map's surface voxels."""
+    seen = ThingSurface(voxel_map, up=up)
     nearest = nearest_points(seen.xyz, surface.xyz, max_distance_m=NEAR_M)
     things = seen.things
-    class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), voxel_map.label_set)
+    channel = labels.channel_map_from(voxel_map.label_set)
+    class_id = labels.to_ids(channel[np.array([thing.class_id for thing in things], np.uint8)])
     confidence = np.array([thing.certainty for thing in things], np.float32)
     matches = match_instances(
         FoundInstances(seen.number, class_id, confidence),
-        np.append(surface.label, np.uint8(ROOMS.ignore_id))[nearest],
+        np.append(surface.label, np.uint8(labels.ignore_id))[nearest],
         np.append(surface.instance, 0)[nearest],
-        ROOMS,
+        labels,
         STUFF_NAMES,
     )
     return things, matches

@@ -2,10 +2,12 @@
 
     python -m research.experiments.things --split test    # maps of 7 s a room are kept
     python -m research.experiments.things --split fit     # and prints the figures of ``queries.instances``
+    python -m research.experiments.things --map kitchen/map.npz redkitchen/mesh_labels.npz    # a real room
 
 A piece is right where its class is that of a true thing and both overlap by at least a quarter of their union, at
-surface voxels (``evaluation.instances``). The baseline is all connected pieces of one class. Count error: for each
-class, by how much the number of things in a room is off; the sum over classes.
+surface voxels (``evaluation.instances``). A mesh has ``vertices``, their ``label`` (ids of the map) and ``instance``, 0
+where nothing is known, and ``T_gravity``, which makes z up. The baseline is all pieces. Count error: for each class, by
+how much the number of things in a room is off; the sum over classes.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from research.evaluation.room_map import kept_room, match_things
+from research.evaluation.instances import InstanceMatches
+from research.evaluation.room_map import TrueSurface, kept_room, match_things
 from research.suites.config import SuiteConfig, suite_seeds
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import EVEN_CONFIDENCE, EVEN_M2, LISTED, Instance
@@ -38,14 +41,26 @@ class Piece(NamedTuple):
     right: bool | None
 
 
-Room = tuple[list[Piece], Counter[str]]  # what was found, the surest first, and the true things by class
+Room = tuple[list[Piece], Counter[str]]  # what was found, by descending certainty, and the true things by class
 
 
 def find_things(seed: int, suite: SuiteConfig, folder: Path) -> Room:
     """The pieces and true things of a room; its map and its true surface are kept in ``folder``."""
     saved, surface = kept_room(seed, suite, folder)
     voxel_map = VoxelMap.load(saved)
-    things, matches = match_things(voxel_map, surface)
+    return _judge(voxel_map, *match_things(voxel_map, surface))
+
+
+def find_real_things(saved: Path, mesh: Path) -> Room:
+    """The pieces in a saved map, and the things of a labelled mesh of the same room."""
+    voxel_map = VoxelMap.load(saved)
+    with np.load(mesh) as true:
+        surface = TrueSurface(true["vertices"], true["label"], true["instance"].astype(np.int64))
+        up = true["T_gravity"][2, :3].astype(np.float64)
+    return _judge(voxel_map, *match_things(voxel_map, surface, voxel_map.label_set, up))
+
+
+def _judge(voxel_map: VoxelMap, things: tuple[Instance, ...], matches: InstanceMatches) -> Room:
     names = dict(zip(voxel_map.label_set.ids, voxel_map.label_set.names, strict=True))
     taken, pieces = set[int](), list[Piece]()
     for thing, match in sorted(zip(things, matches.found, strict=True), key=lambda pair: -pair[0].certainty):
@@ -69,7 +84,7 @@ def show(name: str, rooms: Sequence[Room], listed: Callable[[Instance], bool]) -
     rows += [(key, right[key], found[key], truth[key], error[key]) for key, _ in truth.most_common()]
     print(f"{name}, {len(rooms)} rooms, IoU {IOU}")
     for key, hits, listed_count, true, off in rows:
-        p, r, f1 = hits / max(listed_count, 1), hits / true, 2 * hits / (listed_count + true)
+        p, r, f1 = hits / max(listed_count, 1), hits / max(true, 1), 2 * hits / (listed_count + true)
         print(f"  {key:14s} {true:4d} true, P {p:.3f} R {r:.3f} F1 {f1:.3f}, count error a room {off / len(rooms):.2f}")
 
 
@@ -115,15 +130,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--split", choices=("fit", "val", "test"), default="val")
     parser.add_argument("--folder", type=Path, default=Path("runs/things"))
+    parser.add_argument("--map", type=Path, nargs=2, metavar=("MAP", "MESH"))
     arguments = parser.parse_args()
     suite = SuiteConfig(split="val" if arguments.split == "fit" else arguments.split)
     seeds = FIT_SEEDS if arguments.split == "fit" else suite_seeds(suite)
-    rooms = [find_things(seed, suite, arguments.folder) for seed in seeds]
+    generated = (find_things(seed, suite, arguments.folder) for seed in seeds)
+    rooms = [find_real_things(*arguments.map)] if arguments.map else list(generated)
     show("all pieces", rooms, lambda thing: True)
     show(f"certainty from {LISTED}", rooms, lambda thing: thing.certainty >= LISTED)
     counted = [piece for pieces, _ in rooms for piece in pieces if piece.right is not None]
     show_reliability(counted)
-    if arguments.split == "fit":
+    if arguments.split == "fit" and not arguments.map:
         fit(counted)
 
 

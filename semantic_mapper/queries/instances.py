@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy  # loads `spatial` when it is first used
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
@@ -26,23 +28,29 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
 
-MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
+MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly noise
 LISTED = 0.35  # certainty from which on things are listed: of 0.35, 0.4 and 0.5 the one of the best F1 and counts
 # Area of surface, m^2, from which on a piece of a class with mean confidence EVEN_CONFIDENCE is more likely right than
 # wrong; DEFAULT_M2 for classes that rooms lack. Fitted by ``python -m research.experiments.things --split fit``.
 # fmt: off
 EVEN_M2 = {
-    "bed": 0.754, "table": 0.252, "sink": 0.224, "bathtub": 0.21, "counter": 0.189, "sofa": 0.186,
-    "window": 0.16, "curtain": 0.156, "refrigerator": 0.137, "bookshelf": 0.135, "cabinet": 0.127, "toilet": 0.096,
-    "door": 0.048, "chair": 0.035, "desk": 0.032, "otherfurniture": 0.02, "picture": 0.014, "otherprop": 0.009,
+    "bed": 0.35, "table": 0.219, "sink": 0.166, "sofa": 0.165, "curtain": 0.131, "refrigerator": 0.116,
+    "bathtub": 0.106, "counter": 0.102, "cabinet": 0.092, "bookshelf": 0.09, "window": 0.08, "toilet": 0.079,
+    "door": 0.047, "chair": 0.033, "desk": 0.023, "otherfurniture": 0.017, "picture": 0.013, "otherprop": 0.01,
 }
 # fmt: on
 DEFAULT_M2, EVEN_CONFIDENCE = 0.03, 0.8
-CONFIDENCE_GAIN, AREA_GAIN = 9.42, 1.22  # log-odds a unit of confidence, and of the logarithm of area
+CONFIDENCE_GAIN, AREA_GAIN = 8.68, 1.09  # log-odds a unit of confidence, and of the logarithm of area
 STRAY = 0.005  # of the points of a thing at either end of each axis that do not count for its box
 OWN_AXES = 0.8  # of the floor area of the box along the room's axes: a smaller one of its own axes is taken
 YAW_SAMPLE = 2000  # points that the room's axes are looked for in
 YAW_BIN_M = 0.02
+OTHER = "otherprop"  # small things of any kind, which often touch
+# Surface of one with less than ``CORE_FREE`` of these places round it free, in voxels, is at a seam, not in its core.
+# Distance and fraction: of some, those of the best F1 and counts.
+SEAM_PLACES = 2.5 * np.vstack((np.eye(3), -np.eye(3), np.array([*product((-1, 1), repeat=3)]) / 3**0.5))
+CORE_FREE = 0.4
+GAP_M = 0.1  # pieces of another class that are no farther apart are one thing
 FLAT_M = 0.1  # of a thing that is thinner, only the better seen side of the two counts
 MAX_GONE = 64  # things that have gone, kept to be reported
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
@@ -59,7 +67,7 @@ class OrientedBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instance:
-    """One thing: a connected piece of surface of one class, or what a refined map has as a thing of its own."""
+    """One thing: surface of one class that is connected, as ``find_things`` has it."""
 
     id: int  # above 0; stays with the thing from update to update, and is never given to another
     # class_id, class_name: Of the label set.
@@ -80,7 +88,7 @@ class Instance:
 
     @property
     def unsure(self) -> bool:
-        """Whether it is more likely a stray piece than a thing, and so is listed on request only."""
+        """Whether its certainty is below ``LISTED``, and so it is listed on request only."""
         return self.certainty < LISTED
 
 
@@ -167,7 +175,7 @@ class InstanceTracker:
         wanted[list(snapshot.label_set.thing_ids(STUFF_NAMES))] = True
         with self._lock:
             voxels = thing_voxels(snapshot, wanted)
-            found = find_components(voxels, self._min_voxels)
+            found = find_things(snapshot, voxels, self._min_voxels)
             sizes = np.diff(found.ends, prepend=0)
             ids = np.zeros(len(sizes), np.int64)
             if self._last:
@@ -289,6 +297,55 @@ def find_components(voxels: ThingVoxels, min_voxels: int) -> Components:
     # Numpy sorts integers of 16 bits, which nearly always suffice, much faster than longer ones.
     order = kept[np.argsort(component[kept].astype(np.min_scalar_type(len(large))), kind="stable")]
     return Components(component, order, np.cumsum(sizes[large]))
+
+
+def find_things(snapshot: MapSnapshot, voxels: ThingVoxels, min_voxels: int) -> Components:
+    """As ``find_components``, but pieces of ``OTHER`` are cut at seams, and near ones of other classes are joined."""
+    found, pieces, parts = find_components(voxels, min_voxels), dict[int, list[Int64]](), list[Int64]()
+    for piece in np.split(found.order, found.ends)[:-1]:
+        pieces.setdefault(int(voxels.label[piece[0]]), []).append(piece)
+    for class_id, own in sorted(pieces.items()):
+        if snapshot.label_set.names[snapshot.label_set.ids.index(class_id)] == OTHER:
+            parts += _cut_at_seams(snapshot, voxels, own, min_voxels)
+        else:
+            parts += _join_near(voxels, own, GAP_M / snapshot.voxel_size_m)
+    order, ends = np.concatenate((found.order[:0], *parts)), np.cumsum([len(part) for part in parts], dtype=np.int64)
+    component = np.full(len(voxels.voxel), -1, np.int64)
+    component[order] = np.repeat(np.arange(len(parts)), np.diff(ends, prepend=0))
+    return Components(component, order, ends)
+
+
+def _cut_at_seams(snapshot: MapSnapshot, voxels: ThingVoxels, pieces: Sequence[Int64], min_voxels: int) -> list[Int64]:
+    """Pieces of one class; one with several cores of ``min_voxels`` is divided, each voxel goes to the nearest core."""
+    every = np.sort(np.concatenate(pieces))
+    around = (voxels.point[every] + SEAM_PLACES[:, None]).reshape(-1, 3)
+    free = (read_states(around, snapshot).reshape(len(SEAM_PLACES), -1) == State.FREE).mean(axis=0)
+    at = every[free >= CORE_FREE]
+    packed, _, row, voxel, point, label = voxels
+    start = np.searchsorted(row[at], np.arange(len(packed) + 1))
+    core, parts = np.full(len(row), -1, np.int64), list[Int64]()
+    core[at] = find_components(ThingVoxels(packed, start, row[at], voxel[at], point[at], label[at]), min_voxels)[0]
+    for piece in pieces:
+        number = core[piece]
+        inside = number >= 0
+        if len(cores := np.unique(number[inside])) > 1:
+            _, nearest = scipy.spatial.KDTree(voxels.point[piece[inside]]).query(voxels.point[piece[~inside]])
+            number[~inside] = number[inside][nearest]
+        parts += [piece[number == n] for n in cores] if len(cores) > 1 else [piece]
+    return parts
+
+
+def _join_near(voxels: ThingVoxels, pieces: Sequence[Int64], gap: float) -> list[Int64]:
+    """Pieces of one class; those that are less than ``gap`` voxels apart are one."""
+    points, group = [voxels.point[piece] for piece in pieces], np.arange(len(pieces))
+    low, high = (np.array([end(p, axis=0) for p in points]) for end in (np.min, np.max))
+    near = (low[:, None] - high < gap).all(axis=2)
+    for one, other in np.argwhere(np.triu(near & near.T, 1)).tolist():
+        a, b = points[one], points[other]
+        a = a[((a > low[other] - gap) & (a < high[other] + gap)).all(axis=1)]
+        if len(a) and np.isfinite(scipy.spatial.KDTree(a).query(b, distance_upper_bound=gap)[0]).any():
+            group[group == group[other]] = group[one]
+    return [np.sort(np.concatenate([pieces[k] for k in np.flatnonzero(group == n).tolist()])) for n in np.unique(group)]
 
 
 @kernel

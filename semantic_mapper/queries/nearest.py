@@ -13,7 +13,7 @@ from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point, check_points, check_positive
-from semantic_mapper.queries.instances import LISTED, MIN_VOXELS, certainty_of, find_components, thing_voxels
+from semantic_mapper.queries.instances import LISTED, MIN_VOXELS, certainty_of, find_things, thing_voxels
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
@@ -53,18 +53,13 @@ def nearest(
     place = search_blocks(p, class_id, least, snapshot.packed[rows], snapshot.slots[rows], bounds, index, voxels, found)
     if place < 0:
         return None
-    return NearestSurface(
-        found[:3] * snapshot.voxel_size_m,
-        float(np.sqrt(found[3])) * snapshot.voxel_size_m,
-        float(voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS,
-        bool(voxels.weight.ravel()[place] == MEASURED),
-    )
+    return _answer(snapshot, place, found[:3], float(found[3]))
 
 
 def _nearest_of_things(snapshot: MapSnapshot, class_name: str, p: Float64, least: int) -> NearestSurface | None:
     """As ``nearest`` of a countable class, of the things that are listed; ``p`` (3,) is in units of voxels."""
     found = thing_voxels(snapshot, np.arange(256) == snapshot.label_set.id_of(class_name))
-    pieces = find_components(found, MIN_VOXELS)
+    pieces = find_things(snapshot, found, MIN_VOXELS)
     place = snapshot.slots[found.row].astype(np.int64) * BLOCK_VOXELS + found.voxel
     confidence = snapshot.voxels.confidence.ravel()[place]
     counts = np.zeros(len(place), np.bool_)
@@ -76,12 +71,15 @@ def _nearest_of_things(snapshot: MapSnapshot, class_name: str, p: Float64, least
         return None
     squares = ((found.point[chosen] - p) ** 2).sum(axis=1)
     best = chosen[squares.argmin()]
-    return NearestSurface(
-        found.point[best] * snapshot.voxel_size_m,
-        float(np.sqrt(squares.min())) * snapshot.voxel_size_m,
-        float(confidence[best]) / CONFIDENCE_STEPS,
-        bool(snapshot.voxels.weight.ravel()[place[best]] == MEASURED),
-    )
+    return _answer(snapshot, int(place[best]), found.point[best], float(squares.min()))
+
+
+def _answer(snapshot: MapSnapshot, place: int, point: Float64, square: float) -> NearestSurface:
+    """Of the surface point (3,) of the voxel at ``place`` of all slots, and its squared distance, in voxels."""
+    voxels, size_m = snapshot.voxels, snapshot.voxel_size_m
+    confidence = float(voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
+    measured = bool(voxels.weight.ravel()[place] == MEASURED)
+    return NearestSurface(point * size_m, float(np.sqrt(square)) * size_m, confidence, measured)
 
 
 @kernel

@@ -181,8 +181,7 @@ class BoxRequest(Request[MapPoints], frozen=True, kw_only=True):
 
 
 class InstancesRequest(Request[tuple[Instance, ...]], frozen=True, kw_only=True):
-    """Countable things; ``unsure``: also those that are more likely stray pieces; ``gone``: also those that have gone
-    lately."""
+    """Countable things; ``unsure``: also those of low certainty; ``gone``: also those that have gone lately."""
 
     takes_long: ClassVar[bool] = True
     up: Point

@@ -101,12 +101,16 @@ def painted(plan: UInt8, since: int, version: int) -> BlockChanges:
     tsdf[..., :] = np.array([UNOBSERVED, -100, -65, -30, 60, 90, 127, 127], np.int8)
     label = np.zeros(tsdf.shape, np.uint8)
     label[..., 3] = plan
-    blocks = [(x, y) for x in range(plan.shape[0] // 8) for y in range(plan.shape[1] // 8)]
-    keys = np.array([(x, y, 0) for x, y in blocks], np.int32)
+    return voxels_as_changes(tsdf, label, since, version)
+
+
+def voxels_as_changes(tsdf: np.ndarray, label: UInt8, since: int = 0, version: int = 1) -> BlockChanges:
+    """Voxels (X, Y, Z) int8 and uint8, sides of 8 n, from the origin on."""
+    keys = np.array(list(np.ndindex(*(side // 8 for side in tsdf.shape))), np.int32)
     assert (np.diff(pack_keys(keys)) > 0).all()
 
     def cut(values: np.ndarray) -> np.ndarray:
-        cubes = [values[8 * x : 8 * x + 8, 8 * y : 8 * y + 8] for x, y in blocks]
+        cubes = [values[tuple(slice(8 * k, 8 * k + 8) for k in key)] for key in keys]
         return np.stack([np.ascontiguousarray(cube.transpose(2, 1, 0)).reshape(512) for cube in cubes])
 
     label_rows = cut(label)

@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.labels import make_label_set
 from semantic_mapper.queries.instances import (
     Instance,
     InstanceTracker,
@@ -34,6 +35,7 @@ from tests.queries.scene import (
     integrate,
     painted,
     poses,
+    voxels_as_changes,
     whole,
 )
 
@@ -127,14 +129,29 @@ def test_the_box_of_a_box_is_that_box_also_where_it_is_turned_in_its_room(yaw: f
 
 def test_stray_pieces_are_listed_on_request_only() -> None:
     painting, plan = Painting(), np.zeros((32, 32), np.uint8)
-    plan[2:5, 2:6], plan[8:30, 2:30] = TABLE, TABLE
+    plan[2:5, 2:6], plan[10:30, 2:30] = TABLE, TABLE
     large, stray = sorted(painting.paint(plan).values(), key=lambda thing: -thing.certainty)
     assert (large.unsure, stray.unsure, len(stray.voxels)) == (False, True, 12)
     snapshot = painting.mirror.snapshot()
     assert [thing.id for thing in InstanceTracker(min_voxels=1).update(snapshot)] == [large.id]
-    for unsure, least in ((False, 8), (True, 2)):
+    for unsure, least in ((False, 10), (True, 2)):
         hit = nearest(snapshot, "table", (0, 0, 0), unsure=unsure)
         assert hit is not None and round(hit.xyz[:2].max() / 0.02) == least, unsure
+
+
+@pytest.mark.parametrize(
+    ("name", "apart", "lengths"),
+    [("otherprop", 14, [16, 16]), ("cup", 14, [30]), ("cup", 19, [35]), ("cup", 24, [16, 16])],
+)
+def test_small_things_are_cut_and_near_parts_of_others_joined(name: str, apart: int, lengths: list[int]) -> None:
+    place = np.indices((56, 24, 24))
+    balls = [np.linalg.norm(place - np.reshape((x, 12, 12), (3, 1, 1, 1)), axis=0) - 8 for x in (12, 12 + apart)]
+    distance = np.minimum(*balls)  # voxels
+    mirror = MapMirror(0.02, 4.0, make_label_set("one", ("floor", name), ids=(1, 2), ignore_id=0))
+    tsdf = np.clip(distance / 4 * 127, -127, 127).astype(np.int8)
+    mirror.apply(voxels_as_changes(tsdf, np.where(np.abs(distance) < 2, np.uint8(2), np.uint8(0))))
+    things = InstanceTracker().update(mirror.snapshot())
+    assert [thing.box.size[0] / 0.02 for thing in things] == pytest.approx(lengths, abs=1.5)
 
 
 def test_less_is_seen_of_a_box_from_one_side() -> None:
