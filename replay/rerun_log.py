@@ -190,10 +190,10 @@ class RerunLog:
         large = [thing for thing in graph.things if is_large(thing)]
         tops = [t.box.center + graph.up * (np.abs(t.box.R_world_box.T @ graph.up) @ t.box.size / 2) for t in large]
         tints = {i: (np.array(c) + 255) // 2 for i, c in zip(self._label_set.ids, self._label_set.colors, strict=True)}
-        names = [f"{thing.class_name} {thing.id}" for thing in large]
+        names = [thing.title for thing in large]
         colors = [tints[thing.class_id] for thing in large]  # brown would not be read on black
         self._log_names("world/graph/thing_names", np.array(tops).reshape(-1, 3), names, colors)
-        left = [f"{thing.class_name} {thing.id}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
+        left = [f"{thing.title}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
         self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
 
     def _log_names(self, entity: str, xyz: Float64, names: Sequence[str], colors: Any) -> None:

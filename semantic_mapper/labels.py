@@ -199,5 +199,7 @@ STUFF_NAMES = frozenset(
     "wall floor ceiling floormat otherstructure sky building road roads roadline pavement sidewalk sidewalks parking "
     "terrain vegetation tree fence ground water bridge static background".split()
 )
+# What people call classes whose names do not say it.
+PLAIN_NAMES = {"otherprop": "other object", "otherfurniture": "other furniture", "otherstructure": "other structure"}
 # Classes of things that move by themselves. Vehicles are not among them: most that a camera meets are parked.
 MOVING_NAMES = frozenset("person people human pedestrian rider bicyclist cyclist motorcyclist animal dog cat".split())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
 from semantic_mapper.files import write_json
+from semantic_mapper.labels import PLAIN_NAMES
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -254,19 +255,27 @@ def _instance_table(found: dict[str, Any]) -> Table:
         for thing in things
     ]
     names = ("id", "class", "certainty", "seen", "measured", "centroid, m", "box, m", "gone at, s")
-    return table(rows, names, title=found["map"])
+    return table(rows, names, title=found["map"], caption=_plain_names(things))
 
 
 def _graph_table(found: dict[str, Any]) -> Table:
-    class_of = {thing["id"]: thing["class"] for thing in found["objects"]}
-    rows: list[tuple[object, ...]] = []
-    for room in found["rooms"]:
-        counts = Counter(class_of[number] for number in room["objects"])
-        objects = ", ".join(name if count == 1 else f"{count} {name}" for name, count in sorted(counts.items()))
-        doors = " ".join(map(str, room["neighbours"]))
-        rows.append((room["id"], room["floor"], f"{room['area_m2']:.1f}", doors, objects))
+    def objects(room: int | None) -> str:
+        counts = Counter(thing["class"] for thing in found["objects"] if thing["room"] == room)
+        return ", ".join(name if count == 1 else f"{count} {name}" for name, count in sorted(counts.items()))
+
+    rows: list[tuple[object, ...]] = [
+        (r["id"], r["floor"], f"{r['area_m2']:.1f}", " ".join(map(str, r["neighbours"])), objects(r["id"]))
+        for r in found["rooms"]
+    ]
+    rows += [("none", "", "", "", objects(None))] if objects(None) else []
     names = ("room", "floor", "area, m2", "doors to", "objects")
-    return table(rows, names, title=found["map"], caption="" if found["floors"] else map_answers.NO_FLOOR)
+    caption = _plain_names(found["objects"]) if found["floors"] else map_answers.NO_FLOOR
+    return table(rows, names, title=found["map"], caption=caption)
+
+
+def _plain_names(things: Sequence[dict[str, Any]]) -> str:
+    """What classes are in plain words, where the name does not say it."""
+    return ", ".join(f"{name}: {PLAIN_NAMES[name]}" for name in sorted({t["class"] for t in things} & set(PLAIN_NAMES)))
 
 
 def _joined(xyz: list[float]) -> str:

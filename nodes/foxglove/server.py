@@ -296,7 +296,7 @@ def _thing(thing: Instance, label_set: LabelSet, stamp_ns: int) -> messages.Scen
     pose = messages.Pose(position=position, orientation=rotation)
     cube = messages.CubePrimitive(pose=pose, size=_vector(box.size), color=messages.Color(r=r, g=g, b=b, a=BOX_OPACITY))
     top = box.center + box.R_world_box[:, 2] * (box.size[2] / 2 + TEXT_M)
-    name = _text(f"{thing.class_name} {thing.id}", top, messages.Color(r=r, g=g, b=b, a=1.0))
+    name = _text(thing.title, top, messages.Color(r=r, g=g, b=b, a=1.0))
     return _entity(f"thing/{thing.id}", stamp_ns, cubes=[cube], texts=[name])
 
 

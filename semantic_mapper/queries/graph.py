@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
-from semantic_mapper.labels import STUFF_NAMES, LabelSet
+from semantic_mapper.labels import PLAIN_NAMES, STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.floor_plan import find_up
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.plots import CYCLE, SMALL_PT, TITLE_PT, cut, new_figure, rendered
@@ -357,11 +357,14 @@ def _draw_floor(axes: Axes, graph: SceneGraph, floor: Floor, R_grid_world: Float
             if names.take((x, y), "0.00 m  ", 1.2):
                 axes.annotate(f"{door.width_m:.2f} m", (x, y), (5, 5), textcoords="offset points", fontsize=SMALL_PT)
     for thing in sorted(graph.things, key=lambda thing: -thing.box.size.max()):
-        if graph.room_of[thing.id] in floor.rooms:
+        below = [f for f in graph.floors if f.height_m <= thing.centroid @ graph.up + LOW_M[1]] or graph.floors
+        room = graph.room_of[thing.id]
+        if room in floor.rooms or (room is None and below[-1] == floor):
             x, y = plan(thing.centroid)
             axes.plot(x, y, ".", color="black", markersize=4)
-            if thing.box.size.max() >= NAMED_M and names.take((x, y), thing.class_name, 0.9):
-                axes.annotate(thing.class_name, (x, y), (2, 2), textcoords="offset points", fontsize=SMALL_PT * 0.7)
+            name = PLAIN_NAMES.get(thing.class_name, thing.class_name)
+            if thing.box.size.max() >= NAMED_M and names.take((x, y), name, 0.9):
+                axes.annotate(name, (x, y), (2, 2), textcoords="offset points", fontsize=SMALL_PT * 0.7)
 
 
 class _Names:

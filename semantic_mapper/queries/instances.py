@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.kernels import kernel
-from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.labels import PLAIN_NAMES, STUFF_NAMES
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, pack_keys, unpack_keys
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.mapping.map_types import require_metres
@@ -85,6 +85,11 @@ class Instance:
     seen: float = 1.0
     # stamp of the frame at which most of it was gone; all else is as it was before. None = it is there.
     gone_ns: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What people read: the class in plain words, and the id."""
+        return f"{PLAIN_NAMES.get(self.class_name, self.class_name)} {self.id}"
 
     @property
     def unsure(self) -> bool:

@@ -12,7 +12,7 @@ import pytest
 from semantic_mapper.client import MapClient
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.query import answer, open_saved
+from semantic_mapper.nodes.cli.query import answer, answer_table, open_saved
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.mapping.rendered_views import small_map
@@ -137,3 +137,10 @@ def test_the_frames_of_a_log_are_found_in_a_map_each_world_by_itself(tmp_path: P
     assert off(np.array(told["sessions"][0]["T_map_world"]) @ other_world(), np.eye(4))[0] < 0.1
     alone = told["sessions"][1]
     assert alone["T_map_world"] is None and alone["disagreement"] == "1 of 3 frames agree on it"
+
+
+def test_a_thing_that_is_in_no_room_is_listed_and_its_class_explained() -> None:
+    thing = {"id": 3, "class": "otherprop", "room": None}
+    shown = answer_table({"question": "graph", "map": "m", "floors": [{}], "rooms": [], "objects": [thing]})
+    assert [[column.header, *column.cells] for column in shown.columns] == [["room", "none"], ["objects", "otherprop"]]
+    assert shown.caption == "otherprop: other object"
