@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 
-import typer
 from rich.text import Text
 
-from semantic_mapper.drivers.registry import KINDS, find_cameras
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb, wrong_usage
+from semantic_mapper.drivers.registry import find_cameras
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb
 from semantic_mapper.nodes.console import Output, table
 from semantic_mapper.nodes.doctor import examine
 
@@ -21,7 +19,6 @@ def doctor(
     output: JsonOutput,
     *,
     cameras: bool = False,  # list the cameras that are connected instead, as a config names them
-    kind: list[str] | None = None,  # --cameras: only this kind (v4l2, oak, realsense); may be repeated
 ) -> int:
     """Say what this machine lacks, and the fix; list its cameras.
 
@@ -29,12 +26,10 @@ def doctor(
     not found. A kind of camera whose packages are missing is reported, too.
 
     Example: semantic-mapper doctor
-    Example: semantic-mapper doctor --cameras --kind v4l2 --json
+    Example: semantic-mapper doctor --cameras --json
     """
-    if kind and not cameras:
-        raise typer.BadParameter("goes with --cameras", param_hint="--kind")
     if cameras:
-        _list_cameras(output, kind or ())
+        _list_cameras(output)
         return 0
     checks = examine()
     rows = [(Text(check.state, _STYLES[check.state]), check.name, check.found, check.fix) for check in checks]
@@ -43,9 +38,8 @@ def doctor(
     return EXIT_FAILED if any(check.state == "bad" for check in checks) else 0
 
 
-def _list_cameras(output: Output, kinds: Sequence[str]) -> None:
-    with wrong_usage():
-        found, unknown = find_cameras(tuple(kinds) or KINDS)
+def _list_cameras(output: Output) -> None:
+    found, unknown = find_cameras()
     if found:
         rows = [(camera.kind, camera.name, camera.address, camera.note) for camera in found]
         output.print(table(rows, ("kind", "name", "address", "note"), title="cameras"))

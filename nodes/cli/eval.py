@@ -17,7 +17,6 @@ from semantic_mapper.nodes.cli.verb import (
     WeightsOption,
     must_be_there,
     refuse_options,
-    results_file,
     verb,
 )
 from semantic_mapper.nodes.console import frame_progress
@@ -53,7 +52,8 @@ def evaluate(
     Example: semantic-mapper eval a.mcap --weights a.safetensors --baselines
     Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
-    out = results_file(out)
+    if out is not None and out.is_file() and out.suffix != ".json":  # weights, say, that were named by mistake
+        raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
     must_be_there(*targets)
     for target in targets:
         if target.suffix == MAP_SUFFIX:

@@ -12,7 +12,7 @@ from semantic_mapper.config import Fraction, NotNegative
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, UpOption, verb, wrong_usage
+from semantic_mapper.nodes.cli.verb import JsonOutput, Remote, UpOption, complete_launch, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
 from semantic_mapper.nodes.fleet.store import is_url
@@ -37,40 +37,34 @@ Pair = tuple[float, float]
 def export(
     output: Output,
     # saved map, log, folder with one, or running mapper: `live`, launch, ipc://PATH, tcp://HOST:PORT
-    source: Annotated[str, typer.Argument(metavar="MAP|LOG")],
+    source: Annotated[str, typer.Argument(metavar="MAP|LOG", autocompletion=complete_launch)],
     remote: Remote,
     *,
-    out: Path,  # file to write; its ending says the format
+    out: Path,  # file to write; its ending is the format
     # where the ending does not say it
     format_: Literal[Format, LogFormat] | None = None,
     color: Literal["rgb", "class", "confidence"] | None = None,  # of points and meshes; rgb without it
-    min_weight: float = SURFACE_WEIGHT,  # leave out voxels seen less; 1: also of computed depth
+    min_weight: float = SURFACE_WEIGHT,  # leave out voxels seen less
     min_confidence: Fraction = 0.0,  # leave out surface of less sure class
     up: UpOption = "auto",
-    # grid: what is in the way, above the floor [0.1 1.8]
+    # grid: obstacles, above the floor [0.1 1.8]
     height: Annotated[Pair | None, typer.Option(metavar="LOW HIGH")] = None,
     resolution: float | None = None,  # grid: side of a cell, metres [0.05]
     floor: float | None = None,  # grid: height of the floor [found]
-    costs: Path | None = None,  # grid: also write costs, of a TOML file with lines `person = 100`
+    costs: Path | None = None,  # grid: TOML of costs, lines `person = 100`
     camera: str = "",  # logs: the frames of this camera only
     max_frames: NotNegative = 0,  # logs: stop after this many; 0 = all
 ) -> None:
     """Write a map, or a log, in a format of other programs.
 
     Maps: .ply points (--format ply-mesh: a mesh), .glb mesh, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for
-    nav2: a cell is free only where the floor was seen; --costs writes costs 0 to 100 next to it (mode raw, unknown
-    255).
-
-    Of a running mapper the map as it is now, unlike the file that it saves: only the likeliest class of a voxel, and
-    for --min-weight only whether depth was computed (below 1) or measured (1).
-
-    Logs: .mcap for Foxglove, .txt trajectory (TUM), a folder that `import` reads again without loss, or with
-    --format tum a TUM RGB-D sequence.
+    nav2 (free only where the floor was seen; --costs: 0 to 100, mode raw, unknown 255). A running mapper gives less
+    than its saved map: the likeliest class of a voxel; weight 1, or below for computed depth. Logs: .mcap for Foxglove,
+    .txt trajectory (TUM), folder that `import` reads again without loss, --format tum.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
     Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2
     Example: semantic-mapper export live --out now.ply
-    Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     map_options = (color, height, resolution, floor, costs, up, min_weight, min_confidence)
     path, live = Path(source), is_running_mapper(source)

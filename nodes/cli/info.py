@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -18,7 +18,7 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit, voxel_size_text
 from semantic_mapper.nodes.cli.query import answer, answer_table
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Remote, complete_launch, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.plain_text import counted
@@ -39,7 +39,7 @@ def info(
     output: JsonOutput,
     # log (.mcap), its parts or their folder; saved map, or a folder with one; weights (.safetensors); boxes.json, JSON
     # of `query MAP instances`, or XML of KITTI-360; `live`, ipc://PATH or tcp://HOST:PORT of a mapper
-    file: list[str],
+    file: Annotated[list[str], typer.Argument(autocompletion=complete_launch)],
     remote: Remote,
 ) -> int:
     """Say what a log, a map, weights or a file of boxes holds.

@@ -40,7 +40,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Use a map": {
         "query": ("query:query", "Ask a saved map, or a running mapper, what is where."),
         "info": ("info:info", "Say what a log, a map, weights or a file of boxes holds."),
-        "export": ("export:export", "Write a saved map, or a log, in a format of other programs."),
+        "export": ("export:export", "Write a map, or a log, in a format of other programs."),
         "merge": ("export:merge", "Merge maps of one place into one map."),
         "scale": ("scale:scale", "Give the map of a film metres, and map it again."),
         "refine": ("refine:refine", "Relabel a saved map by its shape, colour and votes."),

@@ -15,7 +15,6 @@ from rich.table import Table
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
-from semantic_mapper.files import write_json
 from semantic_mapper.labels import PLAIN_NAMES
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit
@@ -29,7 +28,6 @@ from semantic_mapper.nodes.cli.verb import (
     complete_launch,
     must_be_there,
     refuse_options,
-    results_file,
     verb,
     wrong_usage,
 )
@@ -85,7 +83,6 @@ def query(
     unsure: bool = False,  # nearest, instances: also below the least certainty
     picture: Path | None = None,  # graph: also draw it from above (.png)
     every: AtLeastOne = 1,  # relocalize: every n-th frame
-    out: Path | None = None,  # also write the answer as JSON
 ) -> int:
     """Ask a saved map, or a running mapper, what is where.
 
@@ -108,9 +105,8 @@ def query(
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
         (picture is not None and question != "graph", "--picture", "goes with `graph`"),
     )
-    written = [path for path in (results_file(out), picture) if path is not None]
-    for path in written:
-        prepare_file(path)
+    if picture is not None:
+        prepare_file(picture)
     code = 0
     if question == "relocalize":
         found = _relocalize(output, source, Path(name), every, live=live)
@@ -124,10 +120,9 @@ def query(
         output.print(answer_table(found))
         if found.get("found") is False and not unsure:
             output.print("nothing is certain enough to be listed; --unsure lists all candidates")
-    if out is not None:
-        write_json(out, found)
     output.json(found)
-    output.lines([f"written to {path}" for path in written])
+    if picture is not None:
+        output.print(f"written to {picture}")
     return code
 
 

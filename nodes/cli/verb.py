@@ -328,14 +328,6 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def results_file(out: Path | None) -> Path | None:
-    """The file that ``--out`` names. Raises typer.BadParameter: the file is there and is no JSON, such as weights that
-    were named by mistake."""
-    if out is not None and out.is_file() and out.suffix != ".json":
-        raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
-    return out
-
-
 def must_be_there(*paths: Path) -> None:
     """Refuse what is missing, or neither a file nor a folder, before the packages that read it are loaded. Raises
     LogError: one of them is."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import rich.live
+import typer
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, refuse_options, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Port, Remote, complete_launch, refuse_options, verb
 from semantic_mapper.nodes.console import Output
 from semantic_mapper.nodes.launcher import running
 from semantic_mapper.nodes.process import StopRequest
@@ -27,7 +28,7 @@ def view(
     remote: Remote,
     # saved map or folder with one, running launch (its socket folder or file's name), or where a mapper answers
     # (tcp://...); by default the one launch that runs here
-    source: str = "",
+    source: Annotated[str, typer.Argument(autocompletion=complete_launch)] = "",
     *,
     port: Port | None = None,  # of the page; 0 = any that is free [9090, or any where that is taken]
     status: bool = False,  # launch: show how its nodes are, as a table in this terminal

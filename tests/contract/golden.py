@@ -112,7 +112,7 @@ def form(value: Any) -> Any:
     """Keys and types of JSON data: what a program that reads it relies on. A list has the form of its first item."""
     if isinstance(value, Mapping):
         return {key: form(item) for key, item in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [form(item) for item in value[:1]]
     return type(value).__name__
 

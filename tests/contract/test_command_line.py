@@ -32,10 +32,10 @@ COMMANDS: dict[str, str] = {
     "import nothing": "import {tmp}/none {tmp}/none.mcap",
     "import with an impossible turn": "import {tmp}/sequence {tmp}/turned.mcap --rotate 45",
     "query info": "query {map} info",
-    "query at": "query {map} at 0.5 -0.5 0.25 --out {tmp}/at.json",
-    "query nearest": "query {stored} nearest wall 0 0 1 --out {tmp}/nearest.json",
-    "query instances": "query {map} instances --up 0,0,1 --out {tmp}/instances.json",
-    "query graph": "query {map} graph --up z --out {tmp}/graph.json",
+    "query at": "query {map} at 0.5 -0.5 0.25 --json",
+    "query nearest": "query {stored} nearest wall 0 0 1 --json",
+    "query instances": "query {map} instances --up 0,0,1 --json",
+    "query graph": "query {map} graph --up z --json",
     "query of an unknown class": "query {map} nearest unicorn 0 0 1",
     "query with too few numbers": "query {map} at 1 2",
     "query of an unknown kind": "query {map} why",
@@ -87,7 +87,6 @@ COMMANDS: dict[str, str] = {
     "label sends without weights": "label {log} --weights {weights}",
     "finetune with labels of nothing": "finetune {log} --labels {tmp}/none --out {tmp}/a.safetensors",
 }
-JSON_FILES = {"query at": "at", "query nearest": "nearest", "query instances": "instances", "query graph": "graph"}
 
 
 def observe(folder: Path) -> dict[str, Any]:
@@ -159,9 +158,7 @@ def run_all(folder: Path, names: list[str]) -> tuple[dict[str, int], dict[str, A
         ran = api.run_here(*words)
         codes[name] = ran.code
         assert "Traceback" not in ran.stderr, ran.stderr
-        if name in JSON_FILES:
-            forms[name] = form(json.loads((folder / f"{JSON_FILES[name]}.json").read_text()))
-        elif "--json" in words:
+        if "--json" in words:
             forms[name] = form(json.loads(ran.stdout))
         elif ran.code and words[:1] not in ([], ["info"], ["compare"]):
             assert not ran.stdout, f"{name}: failed, and wrote results: {ran.stdout}"

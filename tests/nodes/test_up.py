@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.launcher.launch_file import load_launch
 from semantic_mapper.replay.log.format import LogReader
+from tests.contract.golden import form, undocumented
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,
@@ -65,6 +67,9 @@ def test_ctrl_c_writes_the_map_and_no_process_stays(long_log: Path, up: Up, out:
         running.wait_for_line("stream_begins")
         sockets = running.sockets()
         assert sockets.stat().st_mode & 0o777 == 0o700
+        about = json.loads(run_ok("info", sockets, "--json").stdout)
+        assert undocumented("info", form(about)) == [] and about["info"]["scale"] == "metres"
+        assert about["nodes"]["mapper"]["state"] == "running" and about["weights"]["in_use"] == 0
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
         assert len(running.node_pids()) == 3 and not any(map(is_alive, running.node_pids()))
