@@ -29,20 +29,20 @@ from semantic_mapper.config import (
     Positive,
     check_values,
     convert_config,
-    load_config,
     read_json,
     read_toml,
 )
 from semantic_mapper.drivers.lens import ideal_fisheye_view, lens_intrinsics
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import read_regular, write_bytes
-from semantic_mapper.geometry import camera_matrix, check_pose
+from semantic_mapper.geometry import camera_matrix, check_pose, invert_pose
 from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float32, Float64, UInt8
 
 PlaneT = TypeVar("PlaneT", Float32, UInt8)
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]  # a pose, row by row
 _YAML = (".yaml", ".yml")
+SIDES = ("left", "right")  # of a stereo pair, by the half of the images that its device gives
 GUESSED_VIEW_DEG = 60.0  # horizontal, of a camera that nobody has calibrated
 _WANTED = (
     "a calibration has fx fy cx cy width height and distortion (TOML); of YAML, ROS's camera_info (image_width, "
@@ -51,8 +51,8 @@ _WANTED = (
 )
 
 
-class LensTable(Config, frozen=True):
-    """A camera as it stands in a file."""
+class CalibrationFile(Config, frozen=True):
+    """A calibration as it stands on disk."""
 
     fx: Positive
     fy: Positive
@@ -61,24 +61,9 @@ class LensTable(Config, frozen=True):
     width: AtLeastOne
     height: AtLeastOne
     distortion: tuple[float, ...] = ()
-
-
-class CalibrationFile(LensTable, frozen=True):
-    """A calibration as it stands on disk."""
-
     fisheye: bool = False  # the lens is OpenCV's fisheye model, also called equidistant
     T_rig_camera: Matrix | None = None  # of a camera on a rig
     about: dict[str, Any] = msgspec.field(default_factory=dict)  # when, how, how well: for people
-
-
-class StereoFile(Config, frozen=True):
-    """The calibration of a stereo pair as it stands on disk."""
-
-    left: LensTable
-    right: LensTable
-    T_right_left: Matrix
-    swapped: bool = False
-    about: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,47 +118,39 @@ def save_calibration(
 
     ``T_rig_camera`` (4, 4) where the camera is on a rig; ``about``: when, how, how well, for people.
     """
-    lens = _lens_table(measured)
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    lens: dict[str, Any] = {name: getattr(measured, name) for name in names}
+    lens["distortion"] = list(measured.distortion)
     if isinstance(measured, FisheyeIntrinsics):
         lens["fisheye"] = True
     if T_rig_camera is not None:
         lens["T_rig_camera"] = T_rig_camera.tolist()
-    _write(path, {"": lens, "about": about})
-
-
-def load_stereo(path: Path) -> StereoCalibration:
-    """Read the file of a stereo pair.
-
-    Raises ConfigError: missing, the calibration of a single camera, of another form, or with impossible values.
-    """
-    try:
-        file = load_config(path, StereoFile)
-        left, right = _intrinsics(file.left), _intrinsics(file.right)
-    except (FrameError, ConfigError) as error:
-        raise ConfigError(f"{path}: {error}; `semantic-mapper calibrate --stereo` makes the file of a pair") from error
-    if (left.width, left.height) != (right.width, right.height):
-        raise ConfigError(f"{path}: the left and the right images have different sizes")
-    return StereoCalibration(left, right, rigid_matrix(file.T_right_left, f"{path}: T_right_left"), file.swapped)
-
-
-def save_stereo(path: Path, pair: StereoCalibration, about: Mapping[str, str | float]) -> None:
-    """Write the file of a pair, TOML, that reads back to the same numbers; ``ConfigError``: it cannot be written."""
-    whole = {"swapped": pair.swapped, "T_right_left": pair.T_right_left.tolist()}
-    _write(path, {"": whole, "left": _lens_table(pair.left), "right": _lens_table(pair.right), "about": about})
-
-
-def _lens_table(lens: CameraIntrinsics) -> dict[str, Any]:
-    names = ("fx", "fy", "cx", "cy", "width", "height")
-    return {name: getattr(lens, name) for name in names} | {"distortion": list(lens.distortion)}
-
-
-def _write(path: Path, tables: Mapping[str, Mapping[str, Any]]) -> None:
-    lines: list[str] = []
-    for name, table in tables.items():
-        lines += ["", f"[{name}]"] if name else []
-        lines += [f"{key} = {json.dumps(value)}" for key, value in table.items()]  # as TOML has it, too
+    whole, described = ([f"{key} = {json.dumps(value)}" for key, value in part.items()] for part in (lens, about))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, ("\n".join(lines) + "\n").encode(), raises=ConfigError)
+    write_bytes(path, "\n".join([*whole, "", "[about]", *described, ""]).encode(), raises=ConfigError)
+
+
+def load_stereo(folder: Path) -> StereoCalibration:
+    """Read the folder of a stereo pair: a file for each of its ``SIDES``. Where they sit tells whose half is which.
+
+    Raises ConfigError: a file is missing or wrong, does not say where its camera sits or has a fisheye lens, or the two
+    are of different sizes.
+    """
+    files = [folder / f"{side}.toml" for side in SIDES]
+    try:
+        (left, T_rig_left), (right, T_rig_right) = ((load_calibration(file), load_mount(file)) for file in files)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; `semantic-mapper calibrate --stereo` makes the folder of a pair") from error
+    if T_rig_left is None or T_rig_right is None:
+        raise ConfigError(f"{folder}: T_rig_camera is missing; `semantic-mapper calibrate --stereo` finds it")
+    if isinstance(left, FisheyeIntrinsics) or isinstance(right, FisheyeIntrinsics):
+        raise ConfigError(f"{folder}: the cameras of a pair cannot have fisheye lenses")
+    if (left.width, left.height) != (right.width, right.height):
+        raise ConfigError(f"{folder}: the left and the right images have different sizes")
+    T_right_left = invert_pose(T_rig_right) @ T_rig_left
+    if T_right_left[0, 3] > 0:
+        return StereoCalibration(right, left, invert_pose(T_right_left), swapped=True)
+    return StereoCalibration(left, right, T_right_left)
 
 
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:
@@ -240,7 +217,7 @@ class Rectifier:
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _intrinsics(lens: LensTable, model: str = "opencv") -> CameraIntrinsics:
+def _intrinsics(lens: CalibrationFile, model: str = "opencv") -> CameraIntrinsics:
     k, size = (lens.fx, lens.fy, lens.cx, lens.cy), (lens.width, lens.height)
     if model == "opencv" and len(lens.distortion) in COEFFICIENTS:
         return CameraIntrinsics(*k, *size, lens.distortion)

@@ -41,7 +41,7 @@ class StereoCamera(Camera):
         if not config.calibration:
             raise CameraError(
                 f"{where}: has no calibration; make one with `semantic-mapper calibrate --stereo`, and name it with "
-                'calibration = "FILE"'
+                'calibration = "FOLDER"'
             )
         taken = sorted(set(config.source) & set(_OURS))
         if taken:

@@ -14,7 +14,7 @@ class Config(config.Config, frozen=True):
     """One device that gives the images of two cameras side by side. Their size is that of the calibration."""
 
     device: str = ""  # /dev/v4l/by-id/..., a video file, or a URL; has to be given
-    calibration: str = ""  # file of `semantic-mapper calibrate --stereo`; has to be given
+    calibration: str = ""  # folder of `semantic-mapper calibrate --stereo`; has to be given
     # Of the images that come out; narrower ones are matched faster. Never wider than the camera gives them.
     width: AtLeastOne = 640
     min_depth_m: Positive = 0.4  # nearer surfaces are not matched; halving it doubles the work

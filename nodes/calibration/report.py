@@ -16,10 +16,9 @@ from semantic_mapper.config import Config
 from semantic_mapper.drivers.calibrating.camera import COEFFICIENT_NAMES
 from semantic_mapper.drivers.calibrating.rig import Calibration
 from semantic_mapper.drivers.calibrating.views import CELLS, CalibrationConfig, ViewGatherer, missing_regions
-from semantic_mapper.drivers.calibration import StereoCalibration, save_calibration, save_stereo
+from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.drivers.poses.config import BoardPoses
-from semantic_mapper.geometry import invert_pose, rotation_vector
-from semantic_mapper.nodes.calibration.sources import SIDES
+from semantic_mapper.geometry import rotation_vector
 
 _WORST = 3  # views named in the tables
 
@@ -46,30 +45,6 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
         save_calibration(file, camera.intrinsics, None if place is None else place.T_rig_camera, about)
         written.append(file)
     return written
-
-
-def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> Path:
-    """One TOML file of both cameras of a pair; returns its path.
-
-    Cameras are named by the half of the image; their rig tells whose half is which. ``ConfigError``: a file cannot be
-    written; it is as it was.
-    """
-    left, right = (found.cameras[side] for side in SIDES)
-    place = found.rig[SIDES[1]]
-    T_right_left = invert_pose(place.T_rig_camera)
-    swapped = bool(T_right_left[0, 3] > 0)
-    if swapped:
-        left, right, T_right_left = right, left, invert_pose(T_right_left)
-    about = _about(settings) | {
-        "views": min(len(left.views), len(right.views)),
-        "moments": place.moments,
-        "rms_px": round(found.rig_rms_px, 4),
-        "baseline_mm": round(1000 * float(np.linalg.norm(T_right_left[:3, 3])), 3),
-        "sigma_baseline_mm": _rounded(1000 * place.position_sigma_m),
-    }
-    file = out / f"{name}.toml"
-    save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
-    return file
 
 
 def _rounded(value: float) -> float:

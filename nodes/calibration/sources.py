@@ -19,7 +19,7 @@ import structlog
 from semantic_mapper.drivers.base import Camera, CameraImage
 from semantic_mapper.drivers.calibrating.rig import MIN_INSTANTS
 from semantic_mapper.drivers.calibrating.views import CalibrationConfig, ViewGatherer, simultaneous
-from semantic_mapper.drivers.calibration import guess_intrinsics
+from semantic_mapper.drivers.calibration import SIDES, guess_intrinsics
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.camera import halves
@@ -28,7 +28,6 @@ from semantic_mapper.nodes.options import SOURCE_PATTERN
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.sequence import open_log
 
-SIDES = ("left", "right")  # of a stereo pair, as its cameras are called
 REPORT_S = 2.0
 SPARE_INSTANTS = 4  # live rigs: beyond those needed
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

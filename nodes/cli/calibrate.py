@@ -34,7 +34,7 @@ def calibrate(
     square_mm: float = 0.0,  # side of a square, as measured on the printed board
     size: str = "",  # WIDTHxHEIGHT of V4L2 cameras, as later in use
     known: bool = False,  # keep the intrinsics that the source tells; find the rig alone
-    stereo: bool = False,  # the source gives two images side by side: one file for the pair
+    stereo: bool = False,  # the source gives two images side by side: a folder NAME for the pair
     seconds: float = 180.0,  # how long to look through live cameras, at most
 ) -> None:
     """Calibrate cameras from images of a printed ChArUco board.
@@ -42,7 +42,7 @@ def calibrate(
     Print the board (--board), glue it to something flat, measure a square (--square-mm). Show it to the camera near and
     far, at all edges and corners of the image, leaning up, down and to both sides; hold it still each time. Several
     cameras are a rig: they have to see it at the same time, and the first one is where the rig is. Poor coverage is
-    refused, with what is missing. Drivers take NAME.toml as `calibration`.
+    refused, with what is missing. Drivers take NAME.toml, of a pair the folder, as `calibration`.
 
     Example: semantic-mapper calibrate --board board.png
     Example: semantic-mapper calibrate v4l2:/dev/video0 --square-mm 39.6
@@ -68,10 +68,7 @@ def calibrate(
             names = ", ".join(keep) or "none"
             raise ConfigError(f"{names}: calibrated by its maker already; name several cameras to find where they sit")
         found = solve(gathered.cameras, keep, settings.calibration, rig=rig)
-        if stereo:
-            files = [report.write_stereo(out, places[0].name, found, settings)]
-        else:
-            files = report.write_files(out, found, settings)
+        files = report.write_files(out / places[0].name if stereo else out, found, settings)
     plain = report.as_json(found, gathered.cameras, files)
     for part in (*report.tables(plain), *files):
         output.print(part)

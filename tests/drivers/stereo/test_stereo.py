@@ -13,7 +13,7 @@ import pytest
 
 from research.scenes import TEST_SEEDS, camera_path, make_room, render_view
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.calibration import StereoCalibration, load_stereo, save_stereo
+from semantic_mapper.drivers.calibration import StereoCalibration, load_stereo, save_calibration
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
@@ -35,13 +35,16 @@ def T_left_right() -> Float64:  # noqa: N802 - a transform
     return T
 
 
-def the_pair(*, swapped: bool = False) -> StereoCalibration:
-    return StereoCalibration(LEFT, RIGHT, np.linalg.inv(T_left_right()), swapped)
+def the_pair() -> StereoCalibration:
+    return StereoCalibration(LEFT, RIGHT, np.linalg.inv(T_left_right()))
 
 
-def write_pair(path: Path, *, swapped: bool = False) -> str:
-    save_stereo(path, the_pair(swapped=swapped), {"made_by": "a test"})
-    return str(path)
+def write_pair(folder: Path, pair: StereoCalibration | None = None, *, swapped: bool = False) -> str:
+    pair = pair or the_pair()
+    cameras = [(pair.left, np.eye(4)), (pair.right, np.linalg.inv(pair.T_right_left))]
+    for name, (lens, mount) in zip(("left", "right"), cameras[::-1] if swapped else cameras, strict=True):
+        save_calibration(folder / f"{name}.toml", lens, mount, {"made_by": "a test"})
+    return str(folder)
 
 
 def room_pairs(scene: object, poses: Sequence[Float64]) -> list[UInt8]:
@@ -87,7 +90,7 @@ def images_of(film: Film, calibration: str, **settings: Any) -> list[CameraImage
 
 def test_the_depth_of_a_room_is_that_of_the_rectified_left_camera(film: Film, tmp_path: Path) -> None:
     """The errors that a third of a pixel makes: the room is 2 m away in the median, a pixel is 2.4 cm there."""
-    images = images_of(film, write_pair(tmp_path / "pair.toml"))
+    images = images_of(film, write_pair(tmp_path / "pair"))
     rectified = StereoDepth(the_pair(), 480, 0.4, 8.0)
     assert len(images) == COUNT and [image.seq for image in images] == list(range(COUNT))
     for image, T_world_left in zip(images, film.poses, strict=True):
@@ -127,19 +130,18 @@ def shift(x: float) -> Float64:
     return T
 
 
-def test_a_file_of_a_pair_reads_back_to_the_same_numbers_and_swapped_halves_are_put_right(
+def test_the_files_of_a_pair_read_back_to_the_same_numbers_and_swapped_halves_are_put_right(
     film: Film, tmp_path: Path
 ) -> None:
     lens = dataclasses.replace(LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
-    pair = dataclasses.replace(the_pair(swapped=True), left=lens)
-    save_stereo(tmp_path / "pair.toml", pair, {"made_by": 'a "test"', "rms_px": 0.25})
-    read = load_stereo(tmp_path / "pair.toml")
+    pair = dataclasses.replace(the_pair(), left=lens)
+    read = load_stereo(Path(write_pair(tmp_path / "pair", pair, swapped=True)))
     assert (read.left, read.right, read.swapped) == (pair.left, pair.right, True)
-    assert np.array_equal(read.T_right_left, pair.T_right_left)
+    np.testing.assert_allclose(read.T_right_left, pair.T_right_left, atol=1e-12)
     both = room_pairs(film.scene, film.poses[:1])
     other = write_film(tmp_path / "pair.avi", [np.hstack(np.hsplit(image, 2)[::-1]) for image in both])
-    (swapped,) = images_of(dataclasses.replace(film, path=other), write_pair(tmp_path / "p.toml", swapped=True))
-    plain = images_of(film, write_pair(tmp_path / "q.toml"))[0]
+    (swapped,) = images_of(dataclasses.replace(film, path=other), write_pair(tmp_path / "p", swapped=True))
+    plain = images_of(film, write_pair(tmp_path / "q"))[0]
     assert np.abs(swapped.rgb.astype(int) - plain.rgb).mean() < 2
     assert swapped.depth_m is not None and (swapped.depth_m > 0).mean() > 0.85
 
@@ -149,7 +151,8 @@ def test_a_file_of_a_pair_reads_back_to_the_same_numbers_and_swapped_halves_are_
     [
         ({"device": ""}, CameraError, "no device is named; `doctor --cameras`"),
         ({"calibration": ""}, CameraError, "has no calibration; make one with `semantic-mapper calibrate --stereo`"),
-        ({"calibration": "lens.toml"}, ConfigError, "lens.toml: .*calibrate --stereo` makes the file of a pair"),
+        ({"calibration": "none"}, ConfigError, "none/left.toml: .*calibrate --stereo` makes the folder of a pair"),
+        ({"calibration": "alone"}, ConfigError, "alone: T_rig_camera is missing; .*calibrate --stereo"),
         ({"min_depth_m": 0.05}, ConfigError, r"min_depth_m = 0.05 is too near for this pair: .* 0\.\d\d m is possible"),
         ({"min_depth_m": 9.0}, ConfigError, "must be below max_depth_m = 8"),
         ({"source": {"calibration": "x"}}, CameraError, "`calibration` cannot be a key of `source`"),
@@ -160,18 +163,20 @@ def test_what_cannot_work_is_refused_before_the_device_is_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], error: type[Exception], complaint: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_calibration(tmp_path / "lens.toml")
+    (tmp_path / "alone").mkdir()
+    for side in ("left", "right"):
+        write_calibration(tmp_path / "alone" / f"{side}.toml")
     with pytest.raises(error, match=complaint):
-        stereo(Path("film.avi"), write_pair(tmp_path / "pair.toml"), **settings)
+        stereo(Path("film.avi"), write_pair(tmp_path / "pair"), **settings)
 
 
 def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(film: Film, tmp_path: Path) -> None:
-    turned = dataclasses.replace(the_pair(), T_right_left=shift(0.1))
-    save_stereo(tmp_path / "turned.toml", turned, {})
+    above = np.eye(4)
+    above[:2, 3] = -0.05, 0.1
     with pytest.raises(ConfigError, match="the right camera is not next to the left one"):
-        stereo(film.path, str(tmp_path / "turned.toml"))
+        stereo(film.path, write_pair(tmp_path / "above", dataclasses.replace(the_pair(), T_right_left=above)))
     small = write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
-    camera = stereo(small, write_pair(tmp_path / "pair.toml"))
+    camera = stereo(small, write_pair(tmp_path / "pair"))
     with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 960x360"), camera:
         pass
 
@@ -183,7 +188,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 def test_a_pair_of_a_webcam_is_read_without_its_rectification(machine: Machine, tmp_path: Path) -> None:
     device = machine.plug(Sensor(card="Stereo", sizes=((960, 360), (64, 48))), 0)
-    with stereo(device, write_pair(tmp_path / "pair.toml"), source={"stall_s": PATIENCE_S}) as camera:
+    with stereo(device, write_pair(tmp_path / "pair"), source={"stall_s": PATIENCE_S}) as camera:
         image = next(iter(camera))
         assert image.rgb.shape == (360, 480, 3) and image.depth_m is not None and not image.depth_m.any()
         assert camera.warnings == () and not camera.can_wait
