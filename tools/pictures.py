@@ -12,7 +12,7 @@ from pathlib import Path
 
 from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.nodes.viewer.server import WebViewer
-from semantic_mapper.nodes.viewer.watched_session import WatchedSession
+from semantic_mapper.nodes.viewer.sources import WatchedSession
 from semantic_mapper.replay.artifacts import OVERVIEW_NAME
 from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.log import demo_log

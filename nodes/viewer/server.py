@@ -144,7 +144,7 @@ class ViewerPage(WebViewer):
 
     def watch(self, pipeline: MappingPipeline) -> RerunLog:
         """What shows a session with this pipeline on it."""
-        from semantic_mapper.nodes.viewer.watched_session import WatchedSession
+        from semantic_mapper.nodes.viewer.sources import WatchedSession
 
         return WatchedSession(self.begin, pipeline)
 

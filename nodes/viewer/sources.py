@@ -1,4 +1,4 @@
-"""What the viewer is shown: a saved map, or nodes and map of a running system; ``watched_session`` has logs."""
+"""What the viewer is shown: a saved map, nodes and map of a running system, or a session that maps a log."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
@@ -14,22 +15,29 @@ from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError, TransportError
+from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.map_feed import MapFollower, thinned, thinning
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import MapPoses, Streams
-from semantic_mapper.queries.graph import GraphTracker, find_graph
-from semantic_mapper.queries.snapshot import BlockAges, MapSnapshot
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph, find_graph
+from semantic_mapper.queries.snapshot import BlockAges, MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.rerun_log import RerunLog
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
+if TYPE_CHECKING:
+    from semantic_mapper.mapping.pipeline import MappingPipeline
+
 POLL_S = 0.1
 REFRESH_S = 2.0  # between two maps
 GRAPH_S = 5.0  # between two graphs
 FIRST_FRAME_S = 5.0  # a map is shown as of its newest frame, which may never come
+# Of a session, mapping goes before showing: images so often, and between two maps so many times as long as the last
+# one took.
+IMAGE_S, PAUSE = 0.5, 20.0
 ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
 
 Begin = Callable[[], rr.RecordingStream]  # what is to be shown is open: where does it go?
@@ -83,6 +91,37 @@ class MapShow:
         except MapError as error:
             _log.debug("graph_not_shown", reason=str(error))
         self._graph_at = time.monotonic() + GRAPH_S
+
+
+class WatchedSession(RerunLog):
+    """Shows frames now and then, the map now and then and at the end, in some twentieth of the time."""
+
+    def __init__(self, begin: Begin, pipeline: MappingPipeline) -> None:
+        super().__init__(begin(), pipeline.label_set, pipeline.voxel_map.config.voxel_size_m)
+        self._map = pipeline.voxel_map
+        self._show, self._mirror = MapShow(self), MapMirror.of(self._map)
+        self._image_due, self._map_due = 0.0, time.monotonic() + REFRESH_S
+        self._stamp_ns = 0
+
+    def log_step(self, frame: PosedFrame, update: MapUpdate) -> None:
+        """One frame and what was rendered for it, and the map, where it is time for them."""
+        self._stamp_ns, now = frame.stamp_ns, time.monotonic()
+        if now >= self._image_due:
+            super().log_step(frame, update)
+            self._image_due = now + IMAGE_S
+        if now >= self._map_due:
+            self._show_map()
+            self._map_due = time.monotonic() + max(REFRESH_S, PAUSE * (time.monotonic() - now))
+
+    def finish(self, points: MapPoints, graph: SceneGraph | None = None) -> None:
+        """The map as it is at the end; all has been sent then."""
+        self._show_map()
+        if graph is not None:
+            self.log_graph(graph)
+        self.close()
+
+    def _show_map(self) -> None:
+        self._show.show(self._mirror.apply(self._map.changes(self._mirror.version)), self._stamp_ns)
 
 
 def show_saved(path: Path, begin: Begin) -> None:

@@ -24,7 +24,7 @@ import rerun.chunk
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.viewer import server, watched_session
+from semantic_mapper.nodes.viewer import server, sources
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.snapshot import BlockAges, MapMirror
@@ -122,9 +122,9 @@ def test_a_log_is_mapped_and_shown_with_all_colourings(
     log: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in (("REFRESH_S", 0.0), ("PAUSE", 0.0), ("IMAGE_S", 0.0)):
-        monkeypatch.setattr(watched_session, name, value)
+        monkeypatch.setattr(sources, name, value)
     path = tmp_path / "log.rrd"
-    watch = partial(watched_session.WatchedSession, lambda: recording_file(path))
+    watch = partial(sources.WatchedSession, lambda: recording_file(path))
     replay_log(log, tmp_path / "out", weights, tiny_config(), max_frames=3, watch=watch)
     rows = logged(path)
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
