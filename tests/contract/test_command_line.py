@@ -159,7 +159,7 @@ def run_all(folder: Path, names: list[str]) -> tuple[dict[str, int], dict[str, A
         codes[name] = ran.code
         assert "Traceback" not in ran.stderr, ran.stderr
         if "--json" in words:
-            forms[name] = form(json.loads(ran.stdout))
+            forms[name] = form(json.loads(ran.stdout.replace(f"{LOG.parent}/", "")))
         elif ran.code and words[:1] not in ([], ["info"], ["compare"]):
             assert not ran.stdout, f"{name}: failed, and wrote results: {ran.stdout}"
     return codes, forms
