@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from research.cli import suite_options as suites
-from semantic_mapper.nodes.cli.verb import JsonOption, results_file, verb
+from semantic_mapper.nodes.cli.verb import JsonOption, verb
 
 WeightsOption = Annotated[
     list[Path] | None,
@@ -69,7 +69,9 @@ def benchmark(
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
-    out, print_json = results_file(out), json
+    if out is not None and out.is_file() and out.suffix != ".json":
+        raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
+    print_json = json
     if suite != "rooms":
         del given["seed"]
         suites.refuse_given(suite, given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})

@@ -8,15 +8,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
 from semantic_mapper.config import MAX_FILE_BYTES
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import read_regular
-from semantic_mapper.transport.keys import ServerIdentity, server_identity
 from semantic_mapper.transport.process_folder import is_in_use, own_folders
+
+if TYPE_CHECKING:
+    from semantic_mapper.transport.keys import ServerIdentity
 
 NOTE = "launch.json"
 STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
@@ -118,8 +120,11 @@ def find_mapper(place: str) -> MapperAddress:
         scheme, separator, address = query.partition("://")
         host, _, port = address.rpartition(":")
         endpoint = f"{scheme}://{_ANY_HOST[host]}:{port}" if host in _ANY_HOST else query
-        keys = node.options.get("keys")
-        identity = server_identity(keys=Path(keys).expanduser()) if keys else None
+        identity = None
+        if keys := node.options.get("keys"):
+            from semantic_mapper.transport.keys import server_identity  # loads zmq, of which help has no need
+
+            identity = server_identity(keys=Path(keys).expanduser())
         found.append(MapperAddress(endpoint if separator else f"ipc://{folder}/{query}", identity))
     if len(found) == 1:
         return found[0]
