@@ -18,8 +18,7 @@ from semantic_mapper.mapping.pose_check import MAX_CONTRADICTING, MAX_DISAGREEME
 from semantic_mapper.types import PosedFrame
 from tests.mapping.test_keyframes import keyframe
 from tests.mapping.test_voxel_map import same
-from tests.small import tiny_pipeline
-from tests.small import tiny_frames
+from tests.small import tiny_frames, tiny_pipeline
 
 Change = Callable[[PosedFrame], PosedFrame]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
