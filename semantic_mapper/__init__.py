@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from semantic_mapper.fields.checkpoint import load_checkpoint as load_weights
     from semantic_mapper.labels import LabelSet
     from semantic_mapper.mapper import Mapper
+    from semantic_mapper.mapping.changes import BlockChanges, ClearedBlocks
     from semantic_mapper.mapping.floor_plan import OccupancyGrid
     from semantic_mapper.mapping.map_types import CameraPose, MapPoints
     from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from semantic_mapper.types import PosedFrame
 
 __all__ = [
+    "BlockChanges",
     "CameraPose",
+    "ClearedBlocks",
     "Correction",
     "DistanceField",
     "Door",
@@ -72,6 +75,7 @@ _HOMES = {  # modules below this package, by name; where it is called otherwise 
     "load_weights": "fields.checkpoint:load_checkpoint",
     "LabelSet": "labels",
     "Mapper": "mapper",
+    **dict.fromkeys(("BlockChanges", "ClearedBlocks"), "mapping.changes"),
     "OccupancyGrid": "mapping.floor_plan",
     **dict.fromkeys(("CameraPose", "MapPoints"), "mapping.map_types"),
     "VoxelMap": "mapping.voxel_map",

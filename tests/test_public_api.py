@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 from dataclasses import is_dataclass
@@ -66,5 +67,7 @@ def test_all_that_a_client_receives_is_public() -> None:
         if getattr(kind, "__module__", "").startswith("semantic_mapper.") and kind.__name__ not in found:
             found.add(kind.__name__)
             wanted += get_type_hints(kind).values() if is_dataclass(kind) and kind is not MapSnapshot else ()
+            of_kind = [value for name, value in vars(kind).items() if name[0] != "_" and inspect.isfunction(value)]
+            wanted += [get_type_hints(method)["return"] for method in of_kind]
     assert found <= {*semantic_mapper.__all__}, found - {*semantic_mapper.__all__}
-    assert {"Instance", "OrientedBox", "Room", "MapMirror", "WeightsEntry"} <= found
+    assert {"BlockChanges", "Instance", "OrientedBox", "Room", "MapMirror", "WeightsEntry"} <= found

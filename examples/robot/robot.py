@@ -115,11 +115,9 @@ def draw(
     for code, color in COLORS.items():
         image[costs.cells == code] = color
     points, labels = surface_points(snapshot, surface_voxels(snapshot)), snapshot.label_set
-    row, column = costs.cells_of(points.xyz).T
-    here = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
-    here[here] = costs.at(points.xyz[here]) == OCCUPIED
-    top = np.flatnonzero(here)[np.argsort(points.xyz[here, 2])]
-    image[row[top], column[top]] = labels.colorize(points.label[top])
+    top = np.flatnonzero(costs.at(points.xyz) == OCCUPIED)
+    top = top[np.argsort(points.xyz[top, 2])]
+    image[tuple(costs.cells_of(points.xyz[top]).T)] = labels.colorize(points.label[top])
     x, y = costs.origin_m
     height, width = np.array(costs.cells.shape) * costs.resolution_m
     figure = Figure((4 + 8 * width / max(width, height), 1 + 8 * height / max(width, height)), layout="constrained")
