@@ -9,7 +9,6 @@ import msgspec
 import typer
 from rich.table import Table
 
-from research.bench.fusion import bench_fusion
 from research.bench.plots import draw_walk
 from research.bench.render import bench_render, log_scenes, room_scenes
 from research.bench.walk import SLOPE_MINUTES, WalkPlan, bench_walk
@@ -19,7 +18,6 @@ from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plots import write_picture
-from semantic_mapper.replay.log import demo_log
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Measure speed, as ratios within one run.")
 WeightsOption = Annotated[Path | None, typer.Option(help="Weights; without it those that ship.")]
@@ -46,20 +44,6 @@ def render(
     )
     if out is not None:
         write_json(out, found)
-
-
-@app.command()
-@verb
-def fusion(
-    log: Annotated[Path | None, typer.Option(help="Log with depth; without it that of `demo`.")] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Frames that count.")] = 20,
-) -> None:
-    """Fuse frames of 640x480 into 2 cm voxels: ours with 20 and 40 classes against Open3D's own without any."""
-    found = bench_fusion(log or demo_log(), frames)
-    Output.guarded().print(
-        f"Open3D {found['open3d_ms']} ms a frame without classes, ours {found['ms_20']} ms with 20 "
-        f"({found['ratio_20']} times) and {found['ms_40']} ms with 40 ({found['ratio_40']} times)"
-    )
 
 
 @app.command("map")
