@@ -141,7 +141,7 @@ def main() -> int | str:
     """The command: 0 arrived; 1 with why not; 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(description="Drive to the nearest thing of a class.")
     parser.add_argument("class_name", metavar="CLASS")
-    parser.add_argument("position", nargs=3, type=float, metavar=("X", "Y", "Z"), help="of the robot, world metres")
+    parser.add_argument("position", nargs=3, type=float, help="X Y Z of the robot, world metres")
     parser.add_argument("--at", default="live", metavar="PLACE", help="of the mapper, as of MapClient")
     parser.add_argument("--picture", type=Path, default=Path("path.png"), metavar="FILE", help="to write")
     given = parser.parse_args()
