@@ -28,6 +28,7 @@ _MESSAGE = 400  # letters of what a file says, in a message
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[int, msgspec.Meta(ge=0)]
 AtLeastZero = Annotated[float, msgspec.Meta(ge=0)]
+HeightM = Annotated[float, msgspec.Meta(ge=0, le=20)]  # of a camera over a floor: more are other units
 AtLeastOne = Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 AtLeastTwo = Annotated[int, msgspec.Meta(ge=2, le=MAX_COUNT)]

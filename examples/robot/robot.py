@@ -37,8 +37,8 @@ NAMES = {
 
 
 def plan(costs: OccupancyGrid, start: ArrayLike, goal: ArrayLike, reach_m: float = REACH_M) -> Places:
-    """The shortest way (A*, 8 neighbours) over free cells from ``start`` (3,) to within ``reach_m`` of ``goal`` (3,),
-    world metres; empty where there is none. A start that is inflated is left by the shortest way."""
+    """The shortest path (A*, 8 neighbours) over free cells from ``start`` (3,) to within ``reach_m`` of ``goal`` (3,),
+    world metres; empty where there is none. An inflated start is left by the shortest path."""
     first, end = ((int(row), int(column)) for row, column in costs.cells_of(np.array((start, goal), np.float64)))
     rows, columns = costs.cells.shape
     reach = reach_m / costs.resolution_m
@@ -88,7 +88,7 @@ def drive(client: MapClient, class_name: str, start: ArrayLike, picture: Path) -
             why = str(error)
         else:
             way = plan(costs, driven[-1], thing.xyz) if thing else np.empty((0, 3))
-            why = "" if len(way) else f"no {class_name} is known yet" if thing is None else "no way is known yet"
+            why = "" if len(way) else f"no {class_name} is known yet" if thing is None else "no free path is known yet"
             steps = way[1 : round(STEP_M / costs.resolution_m) + 1]
             driven = np.concatenate((driven, steps))
             if thing and len(way):
@@ -121,10 +121,10 @@ def draw(
     x, y = costs.origin_m
     height, width = np.array(costs.cells.shape) * costs.resolution_m
     figure = Figure((4 + 8 * width / max(width, height), 1 + 8 * height / max(width, height)), layout="constrained")
-    axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"the way to the nearest {name}")
+    axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"path to the nearest {name}")
     axes.imshow(image, origin="lower", extent=(x, x + width, y, y + height))
     places = (costs.cells_of(driven)[:, ::-1] + 0.5) * costs.resolution_m + costs.origin_m
-    axes.plot(*places.T, "-", color="#0050c8", linewidth=3, label="way driven")
+    axes.plot(*places.T, "-", color="#0050c8", linewidth=3, label="path driven")
     axes.plot(*places[0], "o", color="#0050c8", markersize=10, label="start")
     if goal is not None:
         at = (costs.cells_of(np.atleast_2d(goal))[0, ::-1] + 0.5) * costs.resolution_m + costs.origin_m
@@ -141,13 +141,14 @@ def main() -> int | str:
     """The command: 0 arrived; 1 with why not; 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(description="Drive to the nearest thing of a class.")
     parser.add_argument("class_name", metavar="CLASS")
-    parser.add_argument("position", nargs=3, type=float, help="X Y Z of the robot, world metres")
+    for axis in ("X", "Y", "Z"):
+        parser.add_argument(axis, type=float, help="of the robot, world metres")
     parser.add_argument("--at", default="live", metavar="PLACE", help="of the mapper, as of MapClient")
     parser.add_argument("--picture", type=Path, default=Path("path.png"), metavar="FILE", help="to write")
     given = parser.parse_args()
     try:
         with MapClient(given.at) as client:
-            why = drive(client, given.class_name, given.position, given.picture)
+            why = drive(client, given.class_name, (given.X, given.Y, given.Z), given.picture)
     except (SemanticMapperError, OSError) as error:
         return f"sample-robot: {error}"
     except KeyboardInterrupt:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, load_config, nearest
+from semantic_mapper.config import AtLeastOne, AtLeastZero, HeightM, load_config, nearest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
@@ -35,7 +35,7 @@ class SourceOptions(Options, frozen=True):
     focal_prior: AtLeastZero = 0.0  # film: focal length, some pixels
     scale: AtLeastZero = 0.0  # metres per unit of poses without a scale
     square_mm: AtLeastZero = 0.0  # film: side of a board's square in it
-    camera_height: AtLeastZero = 0.0  # film: over the floor, metres
+    camera_height: HeightM = 0.0  # film: over the floor, metres
     # bags: ROLE=NAME (image, depth, info, depth_info, pose); repeated. depth=none (any format): without depth
     topic: list[str] | None = None
     world: str = ""  # bags: frame of tf that poses are in

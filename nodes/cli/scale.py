@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from semantic_mapper.config import AtLeastZero
+from semantic_mapper.config import HeightM
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.verb import JsonOutput, WeightsOption, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import frame_progress, stderr_console
@@ -25,7 +25,7 @@ def scale(
     *,
     # two points of the map, x,y,z each, as `view` and `query` give them, and the metres between them
     known: Annotated[tuple[str, str, float] | None, typer.Option(metavar="A B METRES")] = None,
-    height: AtLeastZero = 0.0,  # in their place: of the camera over the floor, metres, the median of its path
+    height: HeightM = 0.0,  # in their place: of the camera over the floor, metres, the median of its path
     weights: WeightsOption = None,
 ) -> int:
     """Give the map of a film metres, and map it again.
