@@ -98,7 +98,8 @@ def _torch() -> Iterator[Check]:
 
 
 def _weights() -> Iterator[Check]:
-    from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+    from semantic_mapper.fields.checkpoint import load_checkpoint
+    from semantic_mapper.fields.weights import default_checkpoint_path
 
     path = default_checkpoint_path()
     try:

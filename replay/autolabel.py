@@ -133,7 +133,7 @@ def autolabel_log(request: AutolabelRequest, monitor: JobMonitor | None = None) 
 def _load(request: AutolabelRequest, log: Log) -> Mapper:
     """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame."""
     mapper = Mapper.load(request.weights, request.config)
-    model = mapper.checkpoint.model
+    model = mapper.model
     if not model.knows_classes or len(mapper.label_set) < 2:
         raise WeightsError(
             f"{mapper.weights_path}: a field of kind '{model.kind}' knows no classes, or one only, so that it can "
@@ -218,7 +218,7 @@ class _Labeller:
         self.rendered = 0
         self.refused: list[str] = []  # why frames could not be rendered
         self._things = things
-        self._boxed = mapper.checkpoint.model if isinstance(mapper.checkpoint.model, Panoptic) else None
+        self._boxed = model if isinstance(model := mapper.model, Panoptic) else None
         self._thing_pixels: dict[int, dict[str, int]] = {}  # by the id of a thing, by frame
 
     def push(self, message: _Message) -> None:
@@ -247,19 +247,19 @@ class _Labeller:
 
     def note(self) -> AutolabelNote:
         """Figures so far."""
-        checkpoint, request = self._mapper.checkpoint, self._request
+        weights, request = self._mapper.weights, self._request
         return AutolabelNote(
             weights=self._mapper.weights_path.name,
             digest=self.digest,
-            kind=checkpoint.model.kind,
-            classes=checkpoint.label_set.names,
+            kind=weights.kind,
+            classes=weights.label_set.names,
             min_confidence=request.min_confidence,
             overwrite_labels=request.overwrite_labels,
             depth=request.depth,
             max_frames=request.max_frames,
             **self.count,
             mean_confidence=round(self._confidence / self._pixels, 4) if self._pixels else None,
-            train_stamps_ns=tuple(sorted(checkpoint.train_stamps_ns)),
+            train_stamps_ns=tuple(sorted(weights.train_stamps_ns)),
             labelled_pixels=round(self._pixels / self._all_pixels, 4) if self._all_pixels else None,
         )
 

@@ -17,17 +17,12 @@ import numpy as np
 
 from semantic_mapper.config import DepthConfig, MapperConfig, PanopticConfig, VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
-from semantic_mapper.fields.checkpoint import (
-    Checkpoint,
-    anchor_from_frame,
-    default_checkpoint_path,
-    load_checkpoint,
-    save_checkpoint,
-)
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.weights import anchor_from_frame, default_checkpoint_path
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_spread, working_intrinsics
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -382,7 +377,7 @@ class PseudoLabels:
     @property
     def train_stamps_ns(self) -> frozenset[int]:
         """Frames whose true labels those who made them have learned from."""
-        return frozenset() if self.mapper is None else self.mapper.checkpoint.train_stamps_ns
+        return frozenset() if self.mapper is None else self.mapper.weights.train_stamps_ns
 
     def of(self, frame: PosedFrame, number: int) -> PosedFrame:
         """A frame, by its number in the log, with its pseudo label, or without a label."""

@@ -147,22 +147,22 @@ def evaluate_log(
             raise LabelError(f"{log}: has no label images to score against")
         _check_scorable(source)
         mapper = Mapper.load(weights, msgspec.structs.replace(config, depth=depth))
-        checkpoint = mapper.checkpoint
-        if not checkpoint.model.knows_classes:
+        weights_file = mapper.weights
+        if not mapper.model.knows_classes:
             raise WeightsError(
-                f"{mapper.weights_path}: a field of kind '{checkpoint.model.kind}' knows no classes, so that "
+                f"{mapper.weights_path}: a field of kind '{weights_file.kind}' knows no classes, so that "
                 "there is nothing to score; give weights that were trained on labels"
             )
         panoptic = None
         if instances is not None:
             require_metres(source.info.scale_known, "instances")
-            panoptic = PanopticTruth(instances, source, stream_labels, checkpoint.label_set)
+            panoptic = PanopticTruth(instances, source, stream_labels, weights_file.label_set)
         predictors = methods.field_predictors(mapper)
         if baseline_s:
             monitor.start(100)
             predictors |= methods.baseline_predictors(
-                _frames_at(source, checkpoint.train_stamps_ns),
-                checkpoint.label_set,
+                _frames_at(source, weights_file.train_stamps_ns),
+                weights_file.label_set,
                 baseline_s,
                 config.seed,
                 lambda fraction: monitor.set(int(fraction * 100), "fitting the U-Net"),
@@ -173,8 +173,8 @@ def evaluate_log(
             (frame for _, frame in zip(range(total), source, strict=False)),
             predictors,
             stream_labels,
-            checkpoint.label_set,
-            checkpoint.train_stamps_ns,
+            weights_file.label_set,
+            weights_file.train_stamps_ns,
             on_frame=lambda done: monitor.set(done, "scoring"),
             voxel_map=mapper.pipeline.voxel_map,
             panoptic=panoptic,

@@ -14,7 +14,7 @@ import numpy as np
 from semantic_mapper.bundle.scale import find_floor
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.fields.checkpoint import shipped_checkpoint
+from semantic_mapper.fields.weights import shipped_checkpoint
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.artifacts import clear_results

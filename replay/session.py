@@ -18,7 +18,7 @@ import numpy as np
 
 from semantic_mapper.errors import FrameError, LabelError, PoseError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, Segments, confusion_of
-from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.weights import WeightsFile
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -116,7 +116,7 @@ class MapSession:
         self.pipeline = mapper.pipeline
         self.source = source
         self.odometry_sessions = OdometrySessions(self.pipeline, own_first=own_first)
-        self.exclude_stamps = mapper.checkpoint.train_stamps_ns
+        self.exclude_stamps = mapper.weights.train_stamps_ns
         self.published = self.fused = self.dropped = 0
         self.unreadable = 0  # refused by the player of a log; they never came here
         self.scored = self.excluded = 0
@@ -254,10 +254,10 @@ class MapSession:
         check = self.pipeline.domain_check
         return self.range_warning, "" if check is None else check.warning
 
-    def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
+    def follow_weights(self, weights: WeightsFile, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""
-        self.mapper = replace(self.mapper, checkpoint=checkpoint, weights_path=path)
-        self.exclude_stamps |= checkpoint.train_stamps_ns
+        self.mapper = replace(self.mapper, weights=weights, weights_path=path)
+        self.exclude_stamps |= weights.train_stamps_ns
 
     def follow_correction(self) -> None:
         """Take what the scores compare with to the poses that the map has after a correction."""
@@ -296,8 +296,8 @@ class MapSession:
     def more_summary(self) -> dict[str, Any]:
         """What only some summaries say: of weights of one scene, of odometry sessions found in the map."""
         sessions, found = self.odometry_sessions, dict[str, Any]()
-        model, mapped = self.mapper.checkpoint.model, self._mapped
-        if model.holds_scene and model.knows_classes and mapped:
+        mapped = self._mapped
+        if self.pipeline.field.holds_scene and self.mapper.model.knows_classes and mapped:
             found["scene"] = {"known": round(self._known / mapped, 4), "frames_outside": self.outside}
             if self.outside > MOSTLY * mapped:
                 reason = "the weights know less than half of these frames: made for another scene or world frame"

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
-from semantic_mapper.config import MapperConfig, load_config, with_quality
-from semantic_mapper.fields.base import SemanticField
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, find_checkpoint, load_checkpoint
-from semantic_mapper.fields.device import DeviceField, choose_device
+from semantic_mapper.config import MapperConfig, SRayConfig, load_config, with_quality
+from semantic_mapper.errors import WeightsError
+from semantic_mapper.fields.base import StreamField
 from semantic_mapper.fields.domain_check import find_domain_check
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.weights import WeightsFile, default_checkpoint_path, find_checkpoint, load_weights
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import MapUpdate, PosedFrame
+
+if TYPE_CHECKING:
+    from semantic_mapper.fields.learned import LearnedField
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +28,7 @@ class Mapper:
     """A mapping pipeline and the weights that it renders with; ``Mapper.load`` makes one."""
 
     pipeline: MappingPipeline  # what every frame goes through, live or replayed
-    checkpoint: Checkpoint  # the weights, their classes and their training
+    weights: WeightsFile  # what the field is made of, its classes and its training
     weights_path: Path  # file that they came from
 
     @classmethod
@@ -44,14 +46,24 @@ class Mapper:
             config = MapperConfig() if config is None else load_config(Path(config), MapperConfig)
         config = with_quality(config)
         path = default_checkpoint_path() if weights is None else find_checkpoint(Path(weights))
-        checkpoint = load_checkpoint(path)
+        found = load_weights(path)
         if config.render.encode_width == 0:
-            config = replace(config, render=replace(config.render, encode_width=checkpoint.width))
-        field = make_field(checkpoint.model, config)
-        pipeline = MappingPipeline(config, field, checkpoint.label_set, anchors=checkpoint.anchors)
-        network = field.model if isinstance(field, DeviceField) else checkpoint.model
-        pipeline.domain_check = find_domain_check(checkpoint, network)
-        return cls(pipeline, checkpoint, path)
+            config = replace(config, render=replace(config.render, encode_width=found.width))
+        try:
+            field = make_field(found, config)
+        except WeightsError as error:
+            raise WeightsError(f"{path}: {error}") from error
+        pipeline = MappingPipeline(config, field, found.label_set, anchors=found.anchors)
+        pipeline.domain_check = find_domain_check(found, field)
+        return cls(pipeline, found, path)
+
+    @property
+    def model(self) -> LearnedField:
+        """The field in torch, which evaluation looks into and finetuning starts from; loads torch."""
+        from semantic_mapper.fields.checkpoint import build_checkpoint
+
+        built = getattr(self.pipeline.field, "model", None)
+        return built or build_checkpoint(self.weights, self.weights_path).model
 
     @property
     def voxel_map(self) -> VoxelMap:
@@ -71,15 +83,19 @@ class Mapper:
         return self.pipeline.step(frame)
 
 
-def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
-    """The renderer that a config asks for, over given weights.
+def make_field(weights: WeightsFile, config: MapperConfig, like: StreamField[Any] | None = None) -> StreamField[Any]:
+    """The renderer that a config asks for, over given weights; of torch for all but S-Ray on the CPU.
 
-    With ``sampling.mode = "streaming"`` and a model that the compiled renderer covers it is that renderer; otherwise,
-    and on a GPU, it is the eager one. Raises ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
-    """
-    if config.render.device == "cuda":
-        return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)
-    if isinstance(model, SRay) and config.sampling.mode == "streaming":
-        return StreamingSRay(model, config.sampling)
-    model.sampling = config.sampling
-    return model
+    ``like``: one whose encoder has the same weights, which is shared where it can be. Raises ConfigError: a GPU is
+    requested that is not there. WeightsError: weights that do not fit their own config."""
+    if weights.kind == "sray" and config.sampling.mode == "streaming" and config.render.device == "cpu":
+        assert isinstance(weights.config, SRayConfig)
+        shared = like if isinstance(like, StreamingSRay) else None
+        return StreamingSRay(weights.config, weights.label_set, weights.tensors, config.sampling, like=shared)
+    # Loads for seconds and takes half a gigabyte.
+    from semantic_mapper.fields.checkpoint import build_checkpoint
+    from semantic_mapper.fields.device import DeviceField, choose_device
+
+    model = build_checkpoint(weights).model
+    device = choose_device("cuda" if config.render.device == "cuda" else "cpu", 0)
+    return DeviceField(model, device, config.sampling, bfloat16=config.render.bfloat16)

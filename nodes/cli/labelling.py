@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import structlog
 
 from semantic_mapper.errors import FrameError, LabelError, LogError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource

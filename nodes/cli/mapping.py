@@ -67,7 +67,8 @@ def map_(
     """
     must_be_there(*source)
     refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))
-    from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
+    from semantic_mapper.fields.checkpoint import load_checkpoint
+    from semantic_mapper.fields.weights import COMPUTED_DEPTH
     from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)

@@ -12,13 +12,8 @@ import torch
 
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import CodecError, FrameError, LabelError, SemanticMapperError, WeightsError
-from semantic_mapper.fields.checkpoint import (
-    Checkpoint,
-    checkpoint_bytes,
-    default_checkpoint_path,
-    find_checkpoint,
-    load_checkpoint,
-)
+from semantic_mapper.fields.checkpoint import Checkpoint, build_checkpoint, checkpoint_bytes, load_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
@@ -243,7 +238,7 @@ class Finetuner:
             return None
         folder = Path(self.options.out) / WEIGHTS_FOLDER
         try:
-            found = read_kept(folder, in_use.version, in_use.digest, self.start)
+            found = build_checkpoint(read_kept(folder, in_use.version, in_use.digest, self.start.weights))
         except (WeightsError, OSError) as error:
             _log.warning("weights_not_found", version=in_use.version, reason=str(error))
             return None

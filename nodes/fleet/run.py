@@ -39,8 +39,9 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
 from semantic_mapper.evaluation.metrics import Segments, class_sums
-from semantic_mapper.fields.checkpoint import load_checkpoint, shipped_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import SMOOTHING, load_nesf
+from semantic_mapper.fields.weights import shipped_checkpoint
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.store import (

@@ -13,7 +13,7 @@ from typing import Any
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
-from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.weights import WeightsFile
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import FieldTrial
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER, file_of_version, keep_offer, read_kept
@@ -43,7 +43,7 @@ class _Task:
     """Weights on their way into use; ``trial`` once they have been read."""
 
     version: WeightsEntry
-    reading: Future[Checkpoint]
+    reading: Future[WeightsFile]
     requested: bool  # by a person, rather than offered
     trial: FieldTrial | None = None
 
@@ -103,7 +103,7 @@ class LiveWeights(Closing):
             requested, self._requested = self._requested, None
         if requested is not None:
             self._end_task("older ones were requested")
-            entry, start = self._versions[requested], self._mapper.checkpoint
+            entry, start = self._versions[requested], self._mapper.weights
             read = partial(read_kept, self._folder, requested, entry.digest, start) if requested else lambda: start
             self._task = _Task(entry, self._reader.submit(read), requested=True)
         task = self._task
@@ -130,7 +130,7 @@ class LiveWeights(Closing):
             self._refuse(entry, f"they were compared with others than those in use (weights {self._in_use})")
             return
         self._end_task("newer ones came")
-        reading = self._reader.submit(keep_offer, update, self._folder, self._mapper.checkpoint)
+        reading = self._reader.submit(keep_offer, update, self._folder, self._mapper.weights)
         self._task = _Task(entry, reading, requested=False)
 
     def describe(self) -> Weights:
@@ -168,13 +168,13 @@ class LiveWeights(Closing):
             self._requested = self._newest = int(number)
             self._versions[self._newest] = WeightsEntry(self._newest, digest, "earlier")
 
-    def _advance(self, task: _Task, checkpoint: Checkpoint, session: MapSession) -> None:
+    def _advance(self, task: _Task, found: WeightsFile, session: MapSession) -> None:
         """One piece of the work. Errors: these weights cannot be used, which says nothing about their labels."""
         if task.trial is None:
             spread = session.snapshots[:: -(-len(session.snapshots) // COMPARED)]
             frames = () if task.requested else tuple(frame for frame, _ in spread)
-            field = make_field(checkpoint.model, session.pipeline.config)
-            task.trial = FieldTrial(session.pipeline, field, checkpoint.anchors, frames)
+            field = make_field(found, session.pipeline.config, session.pipeline.field)
+            task.trial = FieldTrial(session.pipeline, field, found.anchors, frames)
         if not task.trial.advance():
             return
         agreement = task.trial.agreement
@@ -188,7 +188,7 @@ class LiveWeights(Closing):
         number, before = task.version.version, self._in_use
         back = number < before
         file = file_of_version(self._folder, number) if number else self._mapper.weights_path
-        session.follow_weights(checkpoint, file)
+        session.follow_weights(found, file)
         with self._lock:
             self._task = None
             self._in_use = number

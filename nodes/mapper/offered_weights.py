@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from semantic_mapper.errors import WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, check_same_shape, load_checkpoint
-from semantic_mapper.fields.learned import encode_alike
+from semantic_mapper.fields.weights import WeightsFile, check_same_shape, encode_alike, load_weights
 from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.messages import WeightsUpdate, digest_of
 
@@ -18,7 +17,7 @@ def file_of_version(folder: Path, number: int) -> Path:
     return folder / f"{number:06d}.safetensors"
 
 
-def read_kept(folder: Path, number: int, digest: str, like: Checkpoint) -> Checkpoint:
+def read_kept(folder: Path, number: int, digest: str, like: WeightsFile) -> WeightsFile:
     """Weights that were kept, whose file has this digest; refused where they cannot replace ``like``."""
     path = file_of_version(folder, number)
     if digest_of(path.read_bytes()) != digest:
@@ -26,7 +25,7 @@ def read_kept(folder: Path, number: int, digest: str, like: Checkpoint) -> Check
     return _read(path, like)
 
 
-def keep_offer(update: WeightsUpdate, folder: Path, like: Checkpoint) -> Checkpoint:
+def keep_offer(update: WeightsUpdate, folder: Path, like: WeightsFile) -> WeightsFile:
     """Write the file of an offer and read it; it is not kept where the weights cannot replace ``like``."""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(file_of_version(folder, update.version)) as part:
@@ -34,12 +33,12 @@ def keep_offer(update: WeightsUpdate, folder: Path, like: Checkpoint) -> Checkpo
         return _read(part, like)
 
 
-def _read(path: Path, like: Checkpoint) -> Checkpoint:
+def _read(path: Path, like: WeightsFile) -> WeightsFile:
     check_same_shape(path, like)
-    checkpoint = load_checkpoint(path)
-    if not encode_alike(checkpoint.model, like.model):
+    found = load_weights(path)
+    if not encode_alike(found, like):
         raise WeightsError(
             f"{path.name}: its image encoder is another one, so that keyframes would have to be encoded again; "
             "finetune with frozen_encoder_fraction = 1"
         )
-    return checkpoint
+    return found

@@ -98,11 +98,11 @@ class _Scores:
 def field_predictors(mapper: Mapper) -> dict[str, Predictor]:
     """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
     encoder says of the frame alone, where it has an opinion of single images."""
-    config, model = mapper.pipeline.config, mapper.checkpoint.model
+    config, model = mapper.pipeline.config, mapper.model
     keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
     novel = msgspec.structs.replace(config, keyframes=keyframes)
     pipeline = MappingPipeline(
-        novel, make_field(model, novel), mapper.pipeline.label_set, anchors=mapper.checkpoint.anchors
+        novel, make_field(mapper.weights, novel), mapper.pipeline.label_set, anchors=mapper.weights.anchors
     )
 
     def predictor(pipeline: MappingPipeline) -> Predictor:
@@ -130,7 +130,7 @@ def field_predictors(mapper: Mapper) -> dict[str, Predictor]:
 
 def thing_tellers(mapper: Mapper) -> dict[str, ThingTeller]:
     """The predictors of ``field_predictors`` that tell things apart by themselves, and how: those of boxes."""
-    model = mapper.checkpoint.model
+    model = mapper.model
     return {model.kind: partial(thing_image, model)} if isinstance(model, Panoptic) else {}
 
 

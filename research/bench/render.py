@@ -16,12 +16,12 @@ from research.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.config import MapperConfig, Quality, SamplingConfig, with_quality
 from semantic_mapper.errors import ConfigError, LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, streaming
 from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.render import View, render_view
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.fields.volume import sample_guided
 from semantic_mapper.imaging import depth_prior, resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -122,7 +122,7 @@ def bench_render(
     reference = SRay(checkpoint.model.config, checkpoint.label_set, SamplingConfig(mode="reference"))
     reference.load_state_dict(checkpoint.model.state_dict())
     reference.eval()
-    streaming = StreamingSRay(checkpoint.model)
+    streaming = streaming(checkpoint.model)
     timings: dict[str, list[Timing]] = {}
     scores: dict[str, ConfusionMatrix] = {}
     difference, encode_s = 0.0, []

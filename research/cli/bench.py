@@ -13,7 +13,8 @@ from research.bench.plots import draw_walk
 from research.bench.render import bench_render, log_scenes, room_scenes
 from research.bench.walk import SLOPE_MINUTES, WalkPlan, bench_walk
 from semantic_mapper.config import MapperConfig, load_config
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.console import Output, frame_progress

@@ -38,8 +38,8 @@ from research.suites.store import RecordStore
 from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import NesfWeights, find_nesf, smoothed_votes
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.files import write_json
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.console import FrameProgress, Output, frame_progress, stderr_console

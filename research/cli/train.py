@@ -55,7 +55,8 @@ def train(
     from research.train.train_config import TrainConfig
     from semantic_mapper.config import convert_config, load_config, to_plain
     from semantic_mapper.errors import ConfigError
-    from semantic_mapper.fields.checkpoint import MAP_KIND, save_checkpoint
+    from semantic_mapper.fields.checkpoint import save_checkpoint
+    from semantic_mapper.fields.weights import MAP_KIND
 
     if kind == MAP_KIND or (kind is None and config is not None and _kind_of(config) == MAP_KIND):
         from research.cli.train_nesf import train_on_maps

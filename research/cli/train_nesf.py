@@ -9,8 +9,9 @@ from research.train.map_grids import make_log_maps, make_room_maps
 from research.train.nesf import NesfProgress, NesfTrainConfig, TrainingMap, train_nesf
 from semantic_mapper.config import convert_config, load_config, to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import save_nesf
+from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 

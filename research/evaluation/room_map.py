@@ -27,8 +27,8 @@ from semantic_mapper.evaluation.metrics import (
     confusion_of,
 )
 from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import NesfWeights
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.mapper import Mapper

@@ -33,7 +33,7 @@ from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON
 from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.evaluation.upright import camera_up, upright_rotation
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapper import Mapper

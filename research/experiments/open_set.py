@@ -22,9 +22,10 @@ from research.train.cameras import CameraDraw, draw_camera
 from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.domain_check import STATISTICS, UNLIKE, WIDTH, backbone_digest
 from semantic_mapper.fields.encoder import EfficientNetLite0
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.log.sequence import open_log

@@ -24,8 +24,8 @@ from research.suites.records import CalibrationRecord, InstanceRecord, Rows
 from research.suites.scoring import as_calibration, as_rows, from_rows
 from semantic_mapper.config import Config
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_error, confusion_of
-from semantic_mapper.fields.checkpoint import find_checkpoint
 from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
+from semantic_mapper.fields.weights import find_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap

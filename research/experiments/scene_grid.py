@@ -27,10 +27,10 @@ from research.peers.semantic_nerf import config_for_scene
 from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
-from semantic_mapper.fields.checkpoint import anchor_from_frame
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.scene.grid import GridField
+from semantic_mapper.fields.weights import anchor_from_frame
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig

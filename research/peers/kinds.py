@@ -8,7 +8,8 @@ from research.peers.config import NeuRayConfig, SemanticNeRFConfig
 from semantic_mapper.config import Config, PanopticConfig, SamplingConfig, convert_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields import learned
-from semantic_mapper.fields.learned import FieldKind, LearnedField, field_kinds
+from semantic_mapper.fields.kinds import FieldKind, field_kinds
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 
 NEURAY = FieldKind(NeuRayConfig, "research.peers.neuray", "NeuRay")

@@ -20,17 +20,11 @@ from torch.nn import functional
 from research.peers.config import NeuRayConfig
 from research.peers.rendering import composite_render, weighted_moments
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.base import EncodedViews, check_views, depth_at, encoded_views, spread_at, sure_depth
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sray import (
-    CUES,
-    LEAST_VISIBILITY,
-    DensityNet,
-    GeometryInit,
-    contextual_space,
-    softmax_weights,
-)
+from semantic_mapper.fields.numbers import CUES, LEAST_VISIBILITY
+from semantic_mapper.fields.sray import DensityNet, GeometryInit, contextual_space, softmax_weights
+from semantic_mapper.fields.views import EncodedViews, check_views, depth_at, encoded_views, spread_at, sure_depth
 from semantic_mapper.fields.volume import composite, compositing_weights
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews

@@ -20,9 +20,9 @@ from research.peers.rendering import composite_render, density_from
 from research.peers.seen_bounds import seen_bounds
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size, relu_layers
+from semantic_mapper.fields.views import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews

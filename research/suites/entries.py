@@ -14,8 +14,9 @@ from research.scenes.suite import ROOMS_SUITE
 from research.suites.protocols import Entry
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.weights import find_checkpoint
 
 
 def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from research.suites.config import TierConfig
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import View, render_image
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.fields.volume import around_computed
+from semantic_mapper.fields.views import SemanticField
 from semantic_mapper.imaging import depth_prior, fill_holes, resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -80,7 +80,7 @@ def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.devic
     field.sampling = sampling
     # Exactly this class: a kind derived from it renders in its own way.
     if type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming":
-        return StreamingSRay(field, sampling)
+        return streaming(field, sampling)
     return field
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from research.suites.config import SpacingConfig
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.geometry import LABELLED_VALUE, select_views, transform, unproject, visible_points
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame

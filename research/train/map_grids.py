@@ -21,8 +21,8 @@ from research.scenes.sequence import room_views
 from research.suites.config import MAP_WIDTH, SequenceConfig, camera_of_width
 from research.train.nesf import TrainingMap
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint, open_weights
 from semantic_mapper.fields.nesf import find_rows, pack_cells
+from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint, open_weights
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger

@@ -31,14 +31,8 @@ import torch
 
 from research.suites.entries import load_entries
 from semantic_mapper.errors import ConfigError, SemanticMapperError, WeightsError
-from semantic_mapper.fields.checkpoint import (
-    Checkpoint,
-    default_checkpoint_path,
-    load_checkpoint,
-    open_weights,
-    save_checkpoint,
-    save_tensors,
-)
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path, open_weights, save_tensors
 
 CARD = Path(__file__).resolve().parents[2] / "docs" / "model-card.md"
 BEGIN, END = "<!-- metadata -->", "<!-- /metadata -->"

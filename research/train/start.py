@@ -17,8 +17,9 @@ from research.train.recipe import origin
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import adapt_model, load_checkpoint
-from semantic_mapper.fields.encoder import BACKBONE_STAGES, COLOURS, EfficientNetLite0, ImageEncoder
+from semantic_mapper.fields.encoder import COLOURS, EfficientNetLite0, ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.numbers import BACKBONE_STAGES
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.log_events import get_logger

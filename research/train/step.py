@@ -18,9 +18,10 @@ from research.train.view_draws import (
     withhold_labels,
 )
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, Fraction, SamplingConfig
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.training.losses import COLOUR, DEPTH, IGNORE, SEMANTIC, Loss, guess_loss, image_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,

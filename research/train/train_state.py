@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import nn
 
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import save_tensors
+from semantic_mapper.fields.weights import save_tensors
 
 FORMAT = "semantic-mapper-training"
 VERSION = 3

@@ -1,48 +1,29 @@
-"""Weights files: safetensors with everything needed to use them (model config, label set, recipe, anchors).
-
-Weights that ship may name others that ship as their ``base``, and then hold only the tensors that differ from those.
-
-A finetuned checkpoint carries its *anchors*: the labelled keyframes it was finetuned on, as images at working
-resolution with depth, labels and pose. They are source views of every later render in the same scene.
-"""
+"""Fields with weights: a torch module and where it comes from, read from and written to weights files."""
 
 from __future__ import annotations
 
-# torch and safetensors leave parts of their interface untyped.
+# torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-import json
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from importlib import resources
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
 from torch import nn
 
-from semantic_mapper.config import Config, nearest, to_plain
-from semantic_mapper.errors import SemanticMapperError, WeightsError
+from semantic_mapper.config import SamplingConfig, SRayConfig
+from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.weights import MESSAGE, Tensors, WeightsFile, find_checkpoint, load_weights, weights_bytes
 from semantic_mapper.files import write_bytes
-from semantic_mapper.geometry import check_pose
-from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
+from semantic_mapper.types import PosedFrame
 
-FORMAT = "semantic-mapper-weights"
-VERSION = 3
-MAP_KIND = "nesf"  # of weights that ``fields.nesf`` reads
-MESSAGE = 300  # characters of torch's message, which names every tensor
 NEW_ROW_SPREAD = 0.2
-MAX_WIDTH = 4096  # as ``render.encode_width``
-DEFAULT_WIDTH = 320  # of weights whose recipe does not say
-DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,41 +41,33 @@ class Checkpoint:
         return self.model.label_set
 
     @property
+    def weights(self) -> WeightsFile:
+        """As they stand in a file; tensors on the CPU share memory."""
+        model = self.model
+        return WeightsFile(
+            model.kind, model.config, model.label_set, tensors_of(model), tuple(self.anchors), self.recipe
+        )
+
+    @property
     def width(self) -> int:
-        """Image width that the field was trained at, in pixels."""
-        return msgspec.convert(self.recipe, _Recipe).width
+        """As of ``WeightsFile``."""
+        return self.weights.width
 
     @property
     def train_stamps_ns(self) -> frozenset[int]:
-        """Stamps of the frames whose labels the field has seen; evaluation leaves them out."""
-        return frozenset(msgspec.convert(self.recipe, _Recipe).train_stamps_ns)
+        """As of ``WeightsFile``."""
+        return self.weights.train_stamps_ns
 
 
-COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
-SHIPPED = Path(str(resources.files("semantic_mapper"))) / "weights"
+def tensors_of(model: nn.Module) -> dict[str, NDArray[Any]]:
+    """Weights and buffers by name."""
+    return {name: t.detach().cpu().contiguous().numpy() for name, t in model.state_dict().items()}
 
 
-class _Recipe(msgspec.Struct):
-    """The parts of a recipe that are read here."""
-
-    width: Annotated[int, msgspec.Meta(ge=4, le=MAX_WIDTH)] = DEFAULT_WIDTH
-    train_stamps_ns: list[int] = []
-
-
-def default_checkpoint_path() -> Path:
-    """The small checkpoint that ships with the package."""
-    return SHIPPED / "rooms.safetensors"
-
-
-def find_checkpoint(path: Path) -> Path:
-    """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
-    return path if path.exists() and not path.is_dir() else shipped_checkpoint(path) or path
-
-
-def shipped_checkpoint(name: Path) -> Path | None:
-    """Weights that ship with the package under a name; None where they are missing."""
-    named = SHIPPED / f"{name}.safetensors"
-    return named if name.parent == Path() and named.exists() else None
+def streaming(model: LearnedField, sampling: SamplingConfig | None = None) -> StreamingSRay:
+    """The compiled renderer of an S-Ray; weights on the CPU are shared."""
+    assert isinstance(model.config, SRayConfig)
+    return StreamingSRay(model.config, model.label_set, tensors_of(model), sampling or model.sampling)
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
@@ -111,114 +84,32 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
 def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
     """The weights file of a checkpoint; ``half`` as of ``save_checkpoint``.
     Raises SafetensorError: tensors that the format does not know."""
-    model = checkpoint.model
-    tensors = {f"model.{name}": t.detach().cpu().contiguous() for name, t in model.state_dict().items()}
-    if half or model.stored_in_half:
-        for name, tensor in tensors.items():
-            # Not poses (float64), which it would move, nor running variances, which span more powers of ten.
-            if tensor.is_floating_point() and tensor.dtype != torch.float64 and "running_" not in name:
-                tensors[name] = tensor.half()
-    metadata = describe(model.kind, model.config, model.label_set, checkpoint.recipe)
-    if checkpoint.anchors:
-        anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
-        tensors |= anchor_tensors
-    return save(tensors, metadata)
-
-
-def describe(kind: str, config: Config, label_set: LabelSet, recipe: dict[str, Any]) -> dict[str, str]:
-    """The metadata of a weights file."""
-    return {
-        "format": FORMAT,
-        "version": str(VERSION),
-        "field": kind,
-        "model_config": json.dumps(to_plain(config)),
-        "label_set": msgspec.json.encode(label_set).decode(),
-        "recipe": json.dumps(recipe),
-    }
-
-
-def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
-    """``safetensors.save_file``, whole or not at all. Raises SafetensorError, OSError: it cannot be written."""
-    write_bytes(path, save(tensors, metadata))
+    return weights_bytes(checkpoint.weights, half=half or checkpoint.model.stored_in_half)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a weights file; a name of weights that ship with the package ("rooms-computed-depth") will do.
     Raises WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config."""
     path = find_checkpoint(path)
-    tensors, metadata = open_weights(path)
-    with refusing_damage(path):
-        label_set = unpack_label_set(metadata["label_set"])
-        recipe = json.loads(metadata["recipe"])
-        msgspec.convert(recipe, _Recipe)
-        anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
-        kind = metadata["field"]
-        if kind == MAP_KIND:
-            raise ValueError("they refine saved maps (`refine --weights`) and label no frames")
-        model = build_field(kind, json.loads(metadata["model_config"]), label_set)
-    load_tensors(model, {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")}, path)
-    return Checkpoint(model.eval(), anchors, recipe)
+    return build_checkpoint(load_weights(path), path)
 
 
-@contextmanager
-def refusing_damage(path: Path) -> Generator[None]:
-    """Meanwhile the metadata of a file is read. Raises WeightsError: it is damaged."""
+def build_checkpoint(weights: WeightsFile, path: Path | None = None) -> Checkpoint:
+    """The field of weights, which were read from ``path``.
+    Raises WeightsError: weights that do not fit their own config."""
+    model = build_field(weights.kind, weights.config, weights.label_set)
+    load_tensors(model, weights.tensors, path)
+    return Checkpoint(model.eval(), weights.anchors, weights.recipe)
+
+
+def load_tensors(model: nn.Module, tensors: Tensors, path: Path | None = None) -> None:
+    """Put weights of a file (from ``path``) into a network. Raises WeightsError: they do not fit."""
     try:
-        yield
-    except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
-        reason = " ".join(str(error).split())[:MESSAGE]
-        raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
-
-
-def load_tensors(model: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """Put weights of a file into a network.
-    Raises WeightsError: they do not fit, or hold NaN."""
-    weights = {name: t if t.dtype == torch.float64 else t.float() for name, t in tensors.items()}
-    try:
-        model.load_state_dict(weights)
+        model.load_state_dict({name: torch.from_numpy(np.array(t)) for name, t in tensors.items()})
     except RuntimeError as error:
         first = " ".join(str(error).split())[:MESSAGE]
-        raise WeightsError(f"{path}: weights do not fit their model config: {first}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
-        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
-
-
-def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
-    Raises WeightsError: missing, damaged, of another format or version, or its base is."""
-    if path.exists() and not path.is_file():
-        raise WeightsError(f"{path}: is no regular file; copy its content to one")
-    if not path.exists():
-        named = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
-        raise WeightsError(f"{path}: no such weights file, nor weights of the package{nearest(path.name, named)}")
-    try:
-        with safe_open(path, framework="pt") as stored:
-            metadata = dict(stored.metadata() or {})
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a readable safetensors file ({error}); fetch or train it again") from error
-    found = metadata.get("format"), metadata.get("version")
-    if found != (FORMAT, str(VERSION)):
-        raise WeightsError(f"{path}: not weights of this project that this version reads ({FORMAT} {VERSION})")
-    if "base" in metadata:
-        base = shipped_checkpoint(Path(metadata["base"]))
-        if base is None or base == path:
-            raise WeightsError(f"{path}: needs the weights '{metadata['base']}', which do not ship with this version")
-        tensors = open_weights(base)[0] | tensors
-    return tensors, metadata
-
-
-def check_same_shape(path: Path, like: Checkpoint) -> None:
-    """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
-    Raises WeightsError: no weights file, or one of another network or of other classes."""
-    _, metadata = open_weights(path)
-    with refusing_damage(path):
-        shape = metadata["field"], json.loads(metadata["model_config"]), unpack_label_set(metadata["label_set"])
-    if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config))), like.label_set):
-        raise WeightsError(
-            f"{path.name}: of another network than those in use, or of another label set than '{like.label_set.name}' "
-            f"({len(like.label_set)} classes); finetune those in use, not others"
-        )
+        where = "" if path is None else f"{path}: "
+        raise WeightsError(f"{where}weights do not fit their model config: {first}") from error
 
 
 def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
@@ -238,74 +129,3 @@ def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
         state[name] = torch.stack(rows)
     adapted.load_state_dict(state)
     return adapted.to(next(model.parameters()).device)
-
-
-def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
-    """A frame at working width, with depth rounded as the file stores it."""
-    intrinsics = working_intrinsics(frame.intrinsics, width)
-    depth = None if frame.depth_m is None else resize_depth(frame, intrinsics)
-    return replace(
-        frame,
-        rgb=resize_rgb(frame, intrinsics),
-        depth_m=_depth_from_units(_depth_to_units(depth)),
-        depth_sigma_m=_depth_from_units(_depth_to_units(resize_spread(frame, intrinsics))),
-        label=None if frame.label is None else resize_label(frame.label, intrinsics),
-        label_is_pseudo=False,
-        world=0,
-        intrinsics=intrinsics,
-    )
-
-
-def _depth_to_units(depth_m: Float32 | None) -> NDArray[np.uint16] | None:
-    if depth_m is None:
-        return None
-    return np.rint(np.clip(depth_m, 0, 65535 / DEPTH_UNITS_PER_M) * DEPTH_UNITS_PER_M).astype(np.uint16)
-
-
-def _depth_from_units(units: NDArray[np.uint16] | None) -> Float32 | None:
-    return None if units is None else units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
-
-
-def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor], str]:
-    tensors: dict[str, torch.Tensor] = {}
-    described: list[dict[str, Any]] = []
-    for i, a in enumerate(anchors):
-        images = {"rgb": a.rgb, "label": a.label}
-        images |= {"depth": _depth_to_units(a.depth_m), "depth_sigma": _depth_to_units(a.depth_sigma_m)}
-        for name, image in images.items():
-            if image is not None:
-                tensors[f"anchor.{i}.{name}"] = torch.from_numpy(np.ascontiguousarray(image))
-        k = a.intrinsics
-        about = {"stamp_ns": a.stamp_ns, "seq": a.seq, "camera_id": a.camera_id}
-        about |= {"intrinsics": [k.fx, k.fy, k.cx, k.cy, k.width, k.height]}
-        about |= {"T_world_camera": a.T_world_camera.tolist()}
-        described.append(about)
-    return tensors, json.dumps(described)
-
-
-def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, Any]]) -> tuple[PosedFrame, ...]:
-    anchors: list[PosedFrame] = []
-    for i, d in enumerate(described):
-        pose = np.array(d["T_world_camera"], np.float64)
-        check_pose(pose, f"anchor {i}")
-        found = (tensors.get(f"anchor.{i}.{name}") for name in ("depth", "label", "depth_sigma"))
-        depth, label, sigma = (None if tensor is None else tensor.numpy() for tensor in found)
-        anchors.append(
-            PosedFrame(
-                stamp_ns=int(d["stamp_ns"]),
-                seq=int(d["seq"]),
-                camera_id=str(d["camera_id"]),
-                rgb=tensors[f"anchor.{i}.rgb"].numpy(),
-                depth_m=_depth_from_units(depth),
-                depth_sigma_m=_depth_from_units(sigma),
-                label=label,
-                intrinsics=CameraIntrinsics(*d["intrinsics"]),
-                T_world_camera=pose,
-            )
-        )
-    return tuple(anchors)
-
-
-def unpack_label_set(packed: str) -> LabelSet:
-    """Classes as they stand in the metadata. Raises MsgspecError, LabelError: there is something else."""
-    return msgspec.json.decode(packed, type=LabelSet)

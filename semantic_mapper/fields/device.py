@@ -8,6 +8,7 @@ import copy
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -15,10 +16,13 @@ from torch import nn
 
 from semantic_mapper.config import DeviceName, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import Rays, Rendered, WorkingView
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.render import CHUNK
+from semantic_mapper.fields.views import EncodedViews, stack_views
+from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+from semantic_mapper.types import Float32, RayBatch, SourceViews
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -92,17 +96,21 @@ def _to_float32(result: Any) -> Any:
     return result.float()
 
 
+GPU_CHUNK = 32768  # rays rendered at once: enough to fill one, as long as
+GPU_PAIRS = GPU_CHUNK * 16**2  # pairs of samples that attend to each other are no more: 1 GB of scores for 8 views
+
+
 class DeviceField:
-    """Inference-only field on a device. Satisfies ``SemanticField``.
+    """Inference-only field of torch on a device. Satisfies ``StreamField`` and ``Sampled``.
 
     Weights, features of keyframes and rays stay on the device. Sums on a GPU come in no fixed order: its renders repeat
-    but for the last digits. The model is copied; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
+    but for the last digits. The model is copied on a GPU; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
     """
 
     def __init__(
         self, model: LearnedField, device: torch.device, sampling: SamplingConfig, *, bfloat16: bool = False
     ) -> None:
-        self.model = copy.deepcopy(model).to(device).eval()
+        self.model = (model if device.type == "cpu" else copy.deepcopy(model).to(device)).eval()
         self.device = device
         self.sampling = sampling
         torch.backends.cudnn.allow_tf32 = False  # torch's default rounds convolutions to 10 bits, those of depths, too
@@ -115,18 +123,60 @@ class DeviceField:
         """Classes of the rendered logits, in channel order."""
         return self.model.label_set
 
-    def encode(self, views: SourceViews) -> EncodedViews:
-        """Encode views from anywhere; their features are on the device."""
+    @property
+    def sampling(self) -> SamplingConfig:
+        """Where rays are sampled; may be exchanged between two renders."""
+        return self.model.sampling
+
+    @sampling.setter
+    def sampling(self, sampling: SamplingConfig) -> None:
+        self.model.sampling = sampling
+
+    @property
+    def rays_per_chunk(self) -> int:
+        """Rays to render at once."""
+        sampling = self.sampling
+        samples = sampling.guided if sampling.mode == "streaming" else sampling.coarse + sampling.fine
+        return CHUNK if self.device.type == "cpu" else max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))
+
+    @property
+    def holds_scene(self) -> bool:
+        """As of its kind."""
+        return self.model.holds_scene
+
+    def encode(self, view: WorkingView) -> EncodedViews:
+        """Encode a view; its features are on the device."""
+        tensor = partial(torch.tensor, dtype=torch.float32)
+        channel, sigma_m = view.channel, view.depth_sigma_m
+        views = SourceViews(
+            rgb=torch.from_numpy(view.rgb).permute(2, 0, 1).float().div(255)[None],
+            depth_m=torch.from_numpy(view.depth_m)[None],
+            K=tensor(camera_matrix(view.intrinsics))[None],
+            T_world_camera=tensor(view.T_world_camera)[None],
+            channel=None if channel is None else torch.from_numpy(channel)[None],
+            depth_sigma_m=None if sigma_m is None else torch.from_numpy(sigma_m)[None],
+        )
         with torch.inference_mode():
             return self.model.encode(to_device(views, self.device))
 
-    def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
-        """Logits (m, L, h, w) of the encoded images by themselves, on the device; None where the kind has none."""
-        with torch.inference_mode():
-            return self.model.source_logits(sources)
+    def stack(self, views: Sequence[EncodedViews]) -> EncodedViews:
+        """As ``stack_views``."""
+        return stack_views(views)
 
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """Render rays of the device from views that ``encode`` has encoded; not differentiable."""
-        self.model.sampling = self.sampling
+    def source_logits(self, sources: EncodedViews) -> Float32 | None:
+        """Logits (h, w, L) of an encoded view by itself; None where the kind has none."""
         with torch.inference_mode():
-            return self.model.render(rays, sources)
+            logits = self.model.source_logits(sources)
+            return None if logits is None else logits[0].permute(1, 2, 0).float().cpu().numpy()
+
+    def render(self, rays: Rays, sources: EncodedViews) -> Rendered:
+        """Render rays from views that ``encode`` has encoded."""
+        near, far = (torch.full((len(rays.origin),), bound) for bound in (rays.near_m, rays.far_m))
+        origin, direction, prior, measured = map(
+            torch.from_numpy, (rays.origin, rays.direction, rays.prior_depth_m, rays.measured)
+        )
+        batch = RayBatch(origin, direction, near, far, prior, measured, rays.stamp_ns)
+        with torch.inference_mode():
+            found = self.model.render(to_device(batch, self.device), sources)
+            parts = found.logits, found.depth_m, found.opacity, found.rgb, found.known
+            return Rendered(*(part.cpu().numpy() for part in parts))

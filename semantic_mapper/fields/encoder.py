@@ -9,51 +9,34 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-import math
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import sure_depth
+from semantic_mapper.fields.numbers import (
+    BACKBONE_DEVIATION,
+    BACKBONE_MEAN,
+    BACKBONE_STAGES,
+    COLOUR_DEVIATION,
+    COLOUR_MEAN,
+    NORM_EPSILON,
+    SURFACE_CHANNELS,
+)
+from semantic_mapper.fields.surface_maps import has_depth, surface_maps
+from semantic_mapper.fields.views import sure_depth
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3
-COLOUR_MEAN, COLOUR_DEVIATION = 0.45, 0.25
-MEASURED_FRACTION = 0.05  # of the pixels: with less measured depth a view counts as one without
-
-BACKBONE_STAGES = (  # blocks of one output stride: (channels in, channels out, kernel, stride, expansion) of each
-    ((32, 16, 3, 1, 1),),
-    ((16, 24, 3, 2, 6), (24, 24, 3, 1, 6)),
-    ((24, 40, 5, 2, 6), (40, 40, 5, 1, 6)),
-    (
-        (40, 80, 3, 2, 6),
-        (80, 80, 3, 1, 6),
-        (80, 80, 3, 1, 6),
-        (80, 112, 5, 1, 6),
-        (112, 112, 5, 1, 6),
-        (112, 112, 5, 1, 6),
-    ),
-    ((112, 192, 5, 2, 6), (192, 192, 5, 1, 6), (192, 192, 5, 1, 6), (192, 192, 5, 1, 6)),
-)
 BACKBONE_WIDTHS = tuple(stage[-1][1] for stage in BACKBONE_STAGES)  # channels at strides 2, 4, 8, 16, 32
 BACKBONE_STEM = 32
-BACKBONE_MEAN, BACKBONE_DEVIATION = 127 / 255, 128 / 255  # of the colours in [0, 1] that the published weights expect
-NORM_EPSILON = 1e-3
-
-SURFACE_CHANNELS = 5
-NORMAL_REACH = 2  # pixels to either side between which a normal is taken, at 160 pixels of width
-REFERENCE_WIDTH = 160
-GRAVITY_COLUMNS = 40  # columns of the coarse grid that gravity and the lowest point are found on
-LOWEST_FRACTION = 0.02  # of the points lie below the one that counts as the lowest
-NEAREST_M = 0.2
-GRAVITY_STEPS_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0, 15.0)  # from level or plumb that a surface may be, by step
 
 
 class ResidualBlock(nn.Module):
@@ -252,10 +235,14 @@ class ImageEncoder(nn.Module):
         if self.depth_net is None:
             return self.colour_net(rgb)
         views = sure_depth(views, computed=self.takes_computed_depth)
-        measured = has_depth(views.depth_m)
-        if not bool(measured.any()):
+        depth = views.depth_m.detach().cpu().numpy()
+        deep = [i for i, each in enumerate(depth) if has_depth(each)]
+        if not deep:
             return self.colour_net(rgb)
-        maps = surface_maps(views.depth_m[measured], views.K[measured])
+        K = views.K.detach().cpu().numpy()
+        maps = torch.from_numpy(np.stack([surface_maps(depth[i], K[i]) for i in deep])).to(rgb.device)
+        measured = torch.zeros(len(rgb), dtype=torch.bool, device=rgb.device)
+        measured[deep] = True
         with_depth = self.depth_net(torch.cat((rgb[measured], maps), dim=1))
         if bool(measured.all()):
             return with_depth
@@ -309,11 +296,6 @@ class ImageEncoder(nn.Module):
         return (module for module in self.modules() if isinstance(module, nn.BatchNorm2d))
 
 
-def has_depth(depth_m: torch.Tensor) -> torch.Tensor:
-    """(m,) bool: whether enough of each view (m, H, W) is measured to be worth looking at."""
-    return (depth_m > 0).flatten(1).float().mean(1) >= MEASURED_FRACTION
-
-
 def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
     """Set the norms of a fresh encoder to the statistics of these views, with their depth and without; no weight
     changes. Where no view has depth, the network that would see it is shown a flat wall."""
@@ -324,89 +306,7 @@ def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
     with encoder.batch_statistics(), torch.no_grad():
         encoder(replace(views, depth_m=torch.zeros_like(views.depth_m)))
         if encoder.depth_net is not None:
-            measured = bool(has_depth(views.depth_m).any())
+            measured = any(map(has_depth, views.depth_m.cpu().numpy()))
             encoder(views if measured else replace(views, depth_m=torch.ones_like(views.depth_m)))
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
-
-
-def surface_maps(depth_m: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
-    """Maps of the surface (m, 5, H, W) at each pixel: inverse depth (1 / m), 1 where depth is measured, height above
-    the lowest point in view (m), cosines of the normal with up and with the viewing axis (0 next to holes, where there
-    is no normal). All 0 where depth is not measured."""
-    # Not in bfloat16, whose mantissa of 8 bits would make steps of centimetres.
-    with torch.no_grad(), torch.autocast(depth_m.device.type, enabled=False):
-        if not bool((depth_m > 0).any()):  # also spares a field without depth the work
-            return depth_m.new_zeros(len(depth_m), SURFACE_CHANNELS, *depth_m.shape[1:])
-        measured = depth_m > 0
-        v, u = (torch.arange(n, dtype=depth_m.dtype, device=depth_m.device) for n in depth_m.shape[1:])
-        x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
-        y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
-        points = torch.stack((x * depth_m, y * depth_m, depth_m), dim=1)  # in the camera's axes
-        reach = max(1, round(NORMAL_REACH * depth_m.shape[-1] / REFERENCE_WIDTH))
-        normal, known = surface_normals(points, measured, reach)
-        stride = max(1, depth_m.shape[-1] // GRAVITY_COLUMNS)
-        up = up_direction(normal[..., ::stride, ::stride], known[:, ::stride, ::stride])
-        height = torch.einsum("mihw,mi->mhw", points, up)
-        lowest = _lowest(height[:, ::stride, ::stride], measured[:, ::stride, ::stride])
-        maps = (
-            torch.where(measured, 1 / depth_m.clamp_min(NEAREST_M), 0),
-            measured.to(depth_m.dtype),
-            torch.where(measured, height - lowest[:, None, None], 0),
-            torch.einsum("mihw,mi->mhw", normal, up),
-            normal[:, 2],
-        )
-        return torch.stack(maps, dim=1)
-
-
-def surface_normals(points: torch.Tensor, measured: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normals towards the camera (m, 3, H, W), and where there is one (m, H, W): central differences of points
-    (m, 3, H, W), each between pixels ``reach`` away on either side."""
-    r = reach
-    height, width = measured.shape[-2:]
-    normal = torch.zeros_like(points)
-    known = torch.zeros_like(measured)
-    if min(height, width) <= 2 * r:
-        return normal, known
-    middle = (..., slice(r, -r), slice(r, -r))
-    du = points[..., r:-r, 2 * r :] - points[..., r:-r, : -2 * r]
-    dv = points[..., 2 * r :, r:-r] - points[..., : -2 * r, r:-r]
-    # Written out, because torch's cross product and norm are slow along any but the last axis.
-    (ax, ay, az), (bx, by, bz) = dv.unbind(1), du.unbind(1)
-    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    length = torch.sqrt(x * x + y * y + z * z).clamp_min(1e-9)
-    across = measured[..., r:-r, 2 * r :] & measured[..., r:-r, : -2 * r]
-    known[middle] = measured[middle] & across & measured[..., 2 * r :, r:-r] & measured[..., : -2 * r, r:-r]
-    normal[middle] = torch.stack((x / length, y / length, z / length), dim=1)
-    return normal * known[:, None], known
-
-
-def up_direction(normal: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """Up (m, 3) in camera axes: what most surfaces are level or plumb to (Gupta et al., CVPR 2013, section 3).
-
-    Starting from the camera's own up, take the normals near to and near to square with it, and turn up to fit them;
-    then the same with closer bounds. ``normal`` (m, 3, h, w), ``known`` (m, h, w) bool.
-    """
-    n = normal.flatten(2)  # (m, 3, P)
-    weight = known.flatten(1).to(n.dtype)
-    up = n.new_tensor((0.0, -1.0, 0.0)).expand(len(n), 3)
-    identity = torch.eye(3, dtype=n.dtype, device=n.device)
-    # Keeps up where it is in every direction that no surface speaks of.
-    hold = 1e-3 * weight.sum(1).clamp_min(1)[:, None, None]
-    for bound_deg in GRAVITY_STEPS_DEG:
-        cosine = torch.einsum("mip,mi->mp", n, up).abs()
-        level = cosine > math.cos(math.radians(bound_deg))
-        plumb = cosine < math.sin(math.radians(bound_deg))
-        vote = weight * (plumb.to(n.dtype) - level.to(n.dtype))
-        spread = (n * vote[:, None]) @ n.transpose(1, 2) + hold * (identity - up[:, :, None] * up[:, None, :])
-        axis = torch.linalg.eigh(spread.double())[1][:, :, 0].to(n.dtype)
-        up = torch.where((axis * up).sum(1, keepdim=True) < 0, -axis, axis)
-    return up
-
-
-def _lowest(height: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
-    """(m,) height that only ``LOWEST_FRACTION`` of the measured points lie below; 0 where nothing is measured."""
-    flat = torch.where(measured, height, torch.inf).flatten(1).sort(dim=1).values
-    count = measured.flatten(1).sum(1)
-    found = flat.gather(1, (count * LOWEST_FRACTION).long()[:, None])[:, 0]
-    return torch.where(count > 0, found, 0)

@@ -5,28 +5,20 @@ from __future__ import annotations
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from abc import ABC, abstractmethod
-from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
 
 from semantic_mapper.config import (
     Config,
-    GridFieldConfig,
-    IRTConfig,
-    PanopticConfig,
     SamplingConfig,
-    SRayConfig,
-    UNetFieldConfig,
-    convert_config,
 )
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.volume import sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.kinds import field_config, field_kinds
+from semantic_mapper.fields.views import EncodedViews
+from semantic_mapper.fields.volume import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -45,7 +37,6 @@ class LearnedField(nn.Module, ABC):
     knows_classes: ClassVar[bool] = True  # whether it ever says a class; else there is nothing to label or to score
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
     stored_in_half: ClassVar[bool] = False  # whether files hold its weights as float16
-    encoding_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that ``encode`` uses; none = not known
 
     def __init__(self, config: Config, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__()
@@ -98,51 +89,13 @@ class LearnedField(nn.Module, ABC):
         return render
 
 
-def encode_alike(a: LearnedField, b: LearnedField) -> bool:
-    """Whether what one of two fields has encoded is, to the bit, what the other one would have made of it."""
-    if a.kind != b.kind or a.config != b.config or not a.encoding_parts:
-        return False
-    theirs = b.state_dict()
-    shared = {name: t for name, t in a.state_dict().items() if name.split(".")[0] in a.encoding_parts}
-    return all(torch.equal(tensor, theirs[name]) for name, tensor in shared.items())
-
-
-class FieldKind(NamedTuple):
-    """A kind of field: its settings, and the module and class that make it, imported when one is built."""
-
-    config: type[Config]
-    module: str
-    class_name: str
-
-
-KINDS: dict[str, FieldKind] = {
-    "sray": FieldKind(SRayConfig, "semantic_mapper.fields.sray", "SRay"),
-    "unet": FieldKind(UNetFieldConfig, "semantic_mapper.fields.unet_field", "UNetField"),
-    "grid": FieldKind(GridFieldConfig, "semantic_mapper.fields.scene.grid", "GridField"),
-    "irt": FieldKind(IRTConfig, "semantic_mapper.fields.scene.irt", "IRT"),
-    "panoptic": FieldKind(PanopticConfig, "semantic_mapper.fields.scene.panoptic", "Panoptic"),
-}
-GROUP = "semantic_mapper.fields"  # entry points of other packages, each a ``FieldKind``
-
-
-@cache
-def field_kinds() -> dict[str, FieldKind]:
-    """The kinds of this package, and those that installed packages add by entry points."""
-    return KINDS | {entry.name: entry.load() for entry in entry_points(group=GROUP)}
-
-
 def build_field(
     kind: str, config: dict[str, Any] | Config, label_set: LabelSet, sampling: SamplingConfig | None = None
 ) -> LearnedField:
     """A field with random weights.
     ``config``: of that kind, or plain data for it. Raises ConfigError: no such kind, or a config that does not fit it.
     """
-    if kind not in field_kinds():
-        raise ConfigError(f"no field of kind '{kind}'; there are {', '.join(sorted(field_kinds()))}")
-    config_type, module, class_name = field_kinds()[kind]
-    if isinstance(config, dict):
-        config = convert_config(config, config_type, f"config of field '{kind}'")
-    if not isinstance(config, config_type):
-        raise ConfigError(f"field '{kind}' takes a {config_type.__name__}, got a {type(config).__name__}")
+    config = field_config(kind, config)
+    _, module, class_name = field_kinds()[kind]
     field_type: type[LearnedField] = getattr(import_module(module), class_name)
     return field_type(config, label_set, sampling)

@@ -28,11 +28,11 @@ from torch import nn
 
 from semantic_mapper.config import AtLeastOne, Config, convert_config
 from semantic_mapper.errors import WeightsError
-from semantic_mapper.fields.checkpoint import (
+from semantic_mapper.fields.checkpoint import load_tensors
+from semantic_mapper.fields.weights import (
     MAP_KIND,
     describe,
     find_checkpoint,
-    load_tensors,
     open_weights,
     refusing_damage,
     save_tensors,

@@ -7,42 +7,29 @@ where the field is uncertain, there is.
 
 from __future__ import annotations
 
-# torch and safetensors leave parts of their interface untyped.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.base import EncodedViews, SemanticField
+from semantic_mapper.fields.base import Rays, Rendered, StreamField
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
-from semantic_mapper.rays import pixel_rays
-from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache
-GPU_CHUNK = 32768  # enough to fill one, as long as
-GPU_PAIRS = GPU_CHUNK * 16**2  # pairs of samples that attend to each other are no more: 1 GB of scores for 8 views
+CHUNK = 2048  # rays rendered at once on a CPU: what fits in a core's cache; a field may say otherwise
 COARSEST = 4  # pixels between the first rays, a power of two
-
-
-def chunk_size(rays_per_chunk: int, device: torch.device, sampling: SamplingConfig) -> int:
-    """Rays to render at once; 0 = what suits the device."""
-    if rays_per_chunk or device.type == "cpu":
-        return rays_per_chunk or CPU_CHUNK
-    samples = sampling.guided if sampling.mode == "streaming" else sampling.coarse + sampling.fine
-    return max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A view (H, W) to render from a field, without gradients."""
+    """A view (H, W) to render from a field."""
 
-    field: SemanticField
-    sources: EncodedViews
+    field: StreamField[Any]
+    sources: Any  # what the field has encoded, one view or stacked
     intrinsics: CameraIntrinsics
     T_world_camera: Float64
     prior_depth_m: Float32  # (H, W), 0 = no prior
@@ -51,47 +38,49 @@ class View:
     measured: NDArray[np.bool_] | None = None  # (H, W), where the prior is not filled in; None = wherever there is one
     stamp_ns: int | None = None  # for fields with things that move; None = such things are not there
 
-    def trace(self, flat: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], FieldRender]]:
+    def trace(self, flat: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Rendered]]:
         """Pixels ``flat`` (R,), row by row, and what they render to, chunk by chunk."""
-        device, sampling, measured = self.sources.feature.device, self.sampling, self.measured
-        pose = torch.tensor(self.T_world_camera, device=device, dtype=torch.float32)
-        size = chunk_size(self.rays_per_chunk, device, sampling)
+        T, k, prior = self.T_world_camera.astype(np.float32), self.intrinsics, self.prior_depth_m
+        size = self.rays_per_chunk or getattr(self.field, "rays_per_chunk", CHUNK)
         for start in range(0, len(flat), size):
             part = flat[start : start + size]
-            v, u = np.divmod(part, self.intrinsics.width)
-            rays = pixel_rays(
-                torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(device),
-                self.intrinsics,
-                pose,
-                near_m=sampling.near_m,
-                far_m=sampling.far_m,
-                prior_depth_m=torch.from_numpy(self.prior_depth_m[v, u]).to(device),
-                measured=None if measured is None else torch.from_numpy(measured[v, u]).to(device),
+            v, u = np.divmod(part, k.width)
+            # S-Ray Eq. 3 with z as the parameter: a direction has depth 1.
+            direction = np.stack(((u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(part))), axis=1)
+            rays = Rays(
+                origin=np.tile(T[:3, 3], (len(part), 1)),
+                direction=direction.astype(np.float32) @ T[:3, :3].T,
+                near_m=self.sampling.near_m,
+                far_m=self.sampling.far_m,
+                prior_depth_m=prior[v, u],
+                measured=prior[v, u] > 0 if self.measured is None else self.measured[v, u],
                 stamp_ns=self.stamp_ns,
             )
-            with torch.inference_mode():
-                yield part, self.field.render(rays, self.sources)
+            yield part, self.field.render(rays, self.sources)
 
 
-def render_image(view: View) -> FieldRender:
-    """Every pixel of a view: a ``FieldRender`` of H * W rays, row by row."""
+def render_image(view: View) -> Rendered:
+    """Every pixel of a view: H * W rays, row by row."""
     parts = [render for _, render in view.trace(np.arange(view.prior_depth_m.size))]
-    return FieldRender(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(FieldRender)))
+    return Rendered(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def render_view(view: View) -> tuple[Float32, NDArray[np.bool_], Float32]:
-    """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
-    parts = [_arrays(render) for _, render in view.trace(np.arange(view.prior_depth_m.size))]
-    probabilities, known, depth_m = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    """``render_image`` as images: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
+    probabilities, known, depth_m = _arrays(render_image(view))
     shape = (view.intrinsics.height, view.intrinsics.width)
     return probabilities.reshape(*shape, -1), known.reshape(shape), depth_m.reshape(shape)
 
 
-def _arrays(render: FieldRender) -> tuple[Float32, NDArray[np.bool_], Float32]:
+def _arrays(render: Rendered) -> tuple[Float32, NDArray[np.bool_], Float32]:
     """Class probabilities (R, L), known (R,), and depth (R,), 0 where not known."""
-    with torch.inference_mode():
-        probabilities = torch.softmax(render.logits, dim=-1).cpu().numpy()
-        return probabilities, render.known.cpu().numpy(), (render.depth_m * render.known).cpu().numpy()
+    return softmax(render.logits), render.known, render.depth_m * render.known
+
+
+def softmax(logits: Float32) -> Float32:
+    """Probabilities along the last axis."""
+    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return raised / raised.sum(axis=-1, keepdims=True)
 
 
 def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32, NDArray[np.bool_], Float32, int]:

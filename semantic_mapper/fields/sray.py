@@ -32,8 +32,28 @@ from torch.nn import functional
 
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import (
+from semantic_mapper.fields.encoder import ImageEncoder
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.numbers import (
+    BACKGROUND_M,
+    COLOUR_SCALE,
+    COMMON_FOCAL,
+    CUES,
+    FAR_M,
     GEOMETRY_CHANNELS,
+    HIDDEN,
+    LABEL_UNCERTAINTY,
+    LEAST_VISIBILITY,
+    MEASURED_SCALE,
+    MEASURED_SHIFT,
+    NEAR_M,
+    OWN_DENSITY_OFFSET,
+    OWN_RADIUS_M,
+    PREDICTED_SCALE,
+    SURFACE_CUES,
+    TAU,
+)
+from semantic_mapper.fields.views import (
     EncodedViews,
     check_views,
     depth_at,
@@ -43,8 +63,6 @@ from semantic_mapper.fields.base import (
     spread_at,
     sure_depth,
 )
-from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.volume import (
     composite,
     composite_depth,
@@ -55,22 +73,7 @@ from semantic_mapper.fields.volume import (
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
-NEAR_M, FAR_M = 0.2, 12.0
-OWN_DENSITY_OFFSET = 6.0  # at the start the views decide alone: 0.0025 / m of density of its own
-MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this fraction
-MEASURED_SCALE = 0.01  # initial spread of a measured depth, fraction of z
-PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, fraction of z
-COMMON_FOCAL = 0.69  # focal length in image widths at which a predicted depth is taken as it is
-COLOUR_SCALE = 4.0  # of colours next to features: colours that differ by a quarter have a variance of about 1
-LEAST_VISIBILITY = 1e-4  # a sample that is hidden from every view that it projects into takes all of them alike
-CUES = 4  # hit, visibility, view cosine, spread of the depth: what a view knows of a sample next to its feature
-SURFACE_CUES = CUES + 1  # and whether the view is the query's own, for a token at the surface
-BACKGROUND_M = 1e4  # where a ray ends that meets nothing
-OWN_RADIUS_M = 1e-3  # a view whose camera is that near to the ray's origin is the query's own
-TAU = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
 LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
-HIDDEN = 0.05  # visibility below which a view is left out where another one sees the sample
-LABEL_UNCERTAINTY = 0.05  # hit probability at which a label that a view carries over counts by half
 
 
 class GeometryInit(nn.Module):
@@ -307,7 +310,6 @@ class SRay(LearnedField):
 
     kind = "sray"
     class_rows = ("classifier.weight", "classifier.bias")
-    encoding_parts = ("encoder", "geometry_init")
 
     def __init__(self, config: SRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)

@@ -1,103 +1,193 @@
-"""S-Ray for streaming: the same weights and the same answer as ``SRay``, rendered by the compiled kernel on the CPU."""
+"""S-Ray for streaming: the weights and the answer of ``SRay``, by OpenVINO and a compiled kernel on the CPU."""
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false
 import math
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
-from semantic_mapper.config import SamplingConfig
-from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.base import GEOMETRY_CHANNELS, MIN_DEPTH_M, EncodedViews
-from semantic_mapper.fields.sray import (
+from semantic_mapper.config import SamplingConfig, SRayConfig
+from semantic_mapper.errors import ShapeError, WeightsError
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedSize, Rays, Rendered, WorkingView
+from semantic_mapper.fields.inference import ImageNetwork, check_networks
+from semantic_mapper.fields.numbers import (
     BACKGROUND_M,
     COLOUR_SCALE,
+    CUES,
+    GEOMETRY_CHANNELS,
     HIDDEN,
     LABEL_UNCERTAINTY,
     LEAST_VISIBILITY,
+    MIN_DEPTH_M,
     OWN_DENSITY_OFFSET,
     OWN_RADIUS_M,
+    SURFACE_CUES,
     TAU,
-    MultiHeadAttention,
-    SRay,
+    UNSURE_SPREAD,
 )
-from semantic_mapper.fields.volume import field_render, sample_guided
-from semantic_mapper.geometry import expect_shape
+from semantic_mapper.fields.sampling import guided_samples
+from semantic_mapper.fields.surface_maps import has_depth, surface_maps
+from semantic_mapper.fields.weights import Tensors
+from semantic_mapper.geometry import camera_matrix, expect_shape, invert_pose
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
+from semantic_mapper.types import Float32, Float64
+
+PICTURE_WIDTH = 160  # of the pictures whose features are kept: those of other sizes differ
+ALIGNMENT = 64  # bytes: a matrix product rounds differently where a matrix begins elsewhere
+
+
+class StreamedViews(NamedTuple):
+    """m encoded views of one size, as the kernel takes them."""
+
+    feature: Float32  # (m, h, w, C) the F_j of S-Ray Eq. 5
+    rgb: Float32  # (m, h, w, 3) in [0, 1]
+    geometry: Float32  # (m, h, w, 5) mixture of logistics along each view ray; see ``sray``
+    log_scale: Float32  # (m, h, w) logarithm of the first scale, which is a cue
+    K: Float32  # (m, 4) fx fy cx cy in pixels of (h, w)
+    T_camera_world: Float32  # (m, 3, 4)
+    # (m, H, W) known labels at the size of the encoded images, -1 = none; (m, 0, 0) where no view has any
+    channel: NDArray[np.int16]
+
+    @property
+    def size(self) -> EncodedSize:
+        """Of the feature maps."""
+        return self.feature.shape[1:], ()
+
+    def at(self, T_world_camera: Float64) -> StreamedViews:
+        """One view with another pose (4, 4)."""
+        return self._replace(T_camera_world=_inverse(T_world_camera))
 
 
 class StreamingSRay:
-    """Inference-only S-Ray on the CPU. Satisfies ``SemanticField``.
-    ``model``: trained field; its weights are copied. ``sampling``: guided sampling round the depth prior."""
+    """Inference-only S-Ray on the CPU. Satisfies ``StreamField`` and ``Sampled``.
 
-    def __init__(self, model: SRay, sampling: SamplingConfig | None = None) -> None:
-        self.model = model
+    ``tensors`` are those of a weights file of this ``config``. ``sampling``: guided sampling round the depth prior.
+    ``like``: one whose encoder has the same weights (``weights.encode_alike``), whose networks are shared.
+    Raises WeightsError: tensors that do not fit the config."""
+
+    def __init__(
+        self,
+        config: SRayConfig,
+        label_set: LabelSet,
+        tensors: Tensors,
+        sampling: SamplingConfig | None = None,
+        *,
+        like: StreamingSRay | None = None,
+    ) -> None:
+        self.config = config
+        self.label_set = label_set
         self.sampling = sampling or SamplingConfig()
-        self._weights = _pack_weights(model)
-        self._settings = _Settings(model.config.heads, model.at_surface, COLOUR_SCALE if model.at_surface else 0.0)
+        self.picture: Float32 | None = None  # (D,) of the view that was encoded last; see ``domain_check``
+        try:
+            check_networks(tensors, config)
+            self._weights = _pack_weights(tensors, config, len(label_set))
+        except (KeyError, RuntimeError, ShapeError) as error:
+            reason = f"there is no {error}" if isinstance(error, KeyError) else str(error).splitlines()[-1]
+            raise WeightsError(f"weights do not fit their model config: {reason}") from error
+        self._tensors = tensors
+        self._networks: dict[tuple[int, int, bool], ImageNetwork] = like._networks if like else {}
+        at_surface = config.tokens == "surface"
+        self._settings = _Settings(config.heads, at_surface, COLOUR_SCALE if at_surface else 0.0)
+        self._own_factors = tensors["own_view_factor"] if at_surface else np.ones(2, np.float32)
 
     @property
-    def label_set(self) -> LabelSet:
-        """Classes of the rendered logits, in channel order."""
-        return self.model.label_set
+    def holds_scene(self) -> bool:
+        """It knows no scene but by its views."""
+        return False
 
-    def encode(self, views: SourceViews) -> EncodedViews:
-        """As ``SRay.encode``, with maps laid out channels-last so that a sample reads one cache line, not C."""
-        with torch.inference_mode():
-            encoded = self.model.encode(views)
-            maps = {"feature": encoded.feature, "rgb": encoded.rgb, "geometry": encoded.geometry}
-            return replace(
-                encoded, **{name: m.contiguous(memory_format=torch.channels_last) for name, m in maps.items()}
-            )
+    def encode(self, view: WorkingView) -> StreamedViews:
+        """As ``SRay.encode``. Raises ShapeError: arrays that do not fit together."""
+        height, width = expect_shape(view.rgb, "H W 3", "source rgb").values()
+        expect_shape(view.depth_m, f"{height} {width}", "source depth_m")
+        depth, spread = view.depth_m, np.zeros_like(view.depth_m)
+        if view.depth_sigma_m is not None:
+            # What was computed and is not sure becomes a hole; all of it, for weights that have not learned from such.
+            sure = view.depth_sigma_m <= (UNSURE_SPREAD if self.config.encoder.computed_depth else 0) * depth
+            depth = depth * sure
+            spread = (view.depth_sigma_m * sure / np.maximum(depth, np.float32(1e-3))).astype(np.float32, copy=False)
+        K = camera_matrix(view.intrinsics).astype(np.float32)
+        with_depth = self.config.encoder.depth and has_depth(depth)
+        network = self._network(height, width, with_depth)
+        h, w = network.size
+        # Nearest, not averaged: a mean of depths across an edge lies on no surface.
+        rows, columns = (((np.arange(n) + 0.5) * (full / n)).astype(int) for n, full in ((h, height), (w, width)))
+        small = np.ix_(rows, columns)
+        maps = surface_maps(depth, K) if with_depth else None
+        feature, geometry, picture = network.encode(view.rgb, maps, depth[small], spread[small], float(K[0, 0]) / width)
+        scale = np.array((w / width, h / height), np.float32)
+        lens = np.concatenate((K.diagonal()[:2] * scale, (K[:2, 2] + 0.5) * scale - 0.5))
+        rgb = np.asarray(cv2.resize(view.rgb / np.float32(255), (w, h), interpolation=cv2.INTER_AREA), np.float32)
+        none = np.empty((0, 0), np.int16)
+        channel = none if view.channel is None else view.channel.astype(np.int16)
+        pose = _inverse(view.T_world_camera)
+        self.picture = picture if width == PICTURE_WIDTH and picture.size else None
+        lens, log_scale = lens[None].astype(np.float32), np.log(geometry[None, ..., 1])
+        return StreamedViews(feature[None], rgb[None], geometry[None], log_scale, lens, pose, channel[None])
 
-    def source_logits(self, sources: EncodedViews) -> torch.Tensor:
-        """Logits (m, L, h, w) of the encoded images by themselves."""
-        with torch.inference_mode():
-            return self.model.source_logits(sources)
+    def stack(self, views: Sequence[StreamedViews]) -> StreamedViews:
+        """Join encoded views of one size. Raises ShapeError: none or too many views, or different sizes."""
+        count = sum(len(v.feature) for v in views)
+        if not 1 <= count <= MAX_SOURCE_VIEWS:
+            raise ShapeError(f"a render takes 1 to {MAX_SOURCE_VIEWS} source views, got {count}")
+        sizes = {v.size for v in views}
+        if len(sizes) != 1:
+            raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
+        labelled = next((v.channel.shape[1:] for v in views if v.channel.size), (0, 0))
+        channel = [v.channel if v.channel.size else np.full((len(v.K), *labelled), -1, np.int16) for v in views]
+        joined = StreamedViews(*map(np.concatenate, zip(*(v[:-1] for v in views), strict=True)), channel=channel[0])
+        return joined._replace(channel=np.concatenate(channel))
 
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """Render rays with guided samples; not differentiable."""
-        return self.render_samples(
-            rays, sample_guided(rays, self.sampling), sources, self.sampling.sample_weight_threshold
-        )
+    def source_logits(self, sources: StreamedViews) -> Float32:
+        """Logits (h, w, L) of an encoded image by itself."""
+        s, weights = sources.feature[0], self._weights
+        hidden = np.maximum(s @ weights.semantic_hidden.weight + weights.semantic_hidden.bias, 0)
+        s = s + hidden @ weights.semantic_out.weight + weights.semantic_out.bias
+        return s @ self._tensors["classifier.weight"].T + self._tensors["classifier.bias"]
+
+    def render(self, rays: Rays, sources: StreamedViews) -> Rendered:
+        """Render rays with guided samples."""
+        z = guided_samples(rays.prior_depth_m, rays.near_m, rays.far_m, self.sampling)
+        return self.render_samples(rays, z, sources, self.sampling.sample_weight_threshold)
 
     def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, sample_weight_threshold: float = 0.0
-    ) -> FieldRender:
+        self, rays: Rays, z: Float32, sources: StreamedViews, sample_weight_threshold: float = 0.0
+    ) -> Rendered:
         """Render rays at given sample depths z (R, N); see ``SRay.render_samples``.
-        Raises ShapeError: fewer than 2 samples a ray."""
+        Raises ShapeError: fewer than 2 samples a ray, or maps that do not fit together, or not the model."""
         if z.shape[1] < 2:
             raise ShapeError(f"a ray needs at least 2 samples for its intervals to have a length, got {z.shape[1]}")
-        count, channels = len(z), self.model.config.feature_dim
+        count = len(z)
         expect_shape(rays.origin, f"{count} 3", "ray origins")
         expect_shape(rays.direction, f"{count} 3", "ray directions")
-        # Torch's buffers are aligned alike every time; the product with the classifier rounds differently otherwise.
-        rendered, colour = torch.empty(count, channels), torch.empty(count, 3)
-        depth, opacity, known = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.bool)
-        carried = torch.empty(count, len(self.label_set))
+        _check_views(sources, self.config.feature_dim)
+        rendered = _aligned(count, self.config.feature_dim)
+        colour, carried = np.empty((count, 3), np.float32), np.empty((count, len(self.label_set)), np.float32)
+        depth, opacity = np.empty(count, np.float32), np.empty(count, np.float32)
+        known = np.empty(count, np.bool_)
+        own = np.where(rays.measured, *self._own_factors)
         render_sray(
             count,
-            _Rays(_array(rays.origin), _array(rays.direction), _array(z), _array(self.model.own_view_factors(rays))),
-            _source_maps(sources, channels),
+            _Rays(rays.origin, rays.direction, z, own.astype(np.float32)),
+            sources,
             self._settings._replace(sample_weight_threshold=sample_weight_threshold),
             self._weights,
-            _Rendered(*(t.numpy() for t in (rendered, colour, depth, opacity, known, carried))),
+            _Rendered(rendered, colour, depth, opacity, known, carried),
         )
-        with torch.inference_mode():
-            classifier = self.model.classifier
-            sum_of_weights = 1.0 if self.model.at_surface else opacity[:, None]
-            logits = rendered @ classifier.weight.T + sum_of_weights * classifier.bias
-            logits = logits + self.model.label_logit * carried
-            return field_render(logits=logits, depth_m=depth, opacity=opacity, rgb=colour, known=known)
+        weight, bias = self._tensors["classifier.weight"], self._tensors["classifier.bias"]
+        total = np.float32(1) if self._settings.at_surface else opacity[:, None]
+        logits = rendered @ weight.T + total * bias + self._tensors["label_logit"] * carried
+        return Rendered(logits * known[:, None], depth, opacity, colour, known)
+
+    def _network(self, height: int, width: int, with_depth: bool) -> ImageNetwork:
+        key = height, width, with_depth
+        if key not in self._networks:
+            self._networks[key] = ImageNetwork(self._tensors, self.config, (height, width), with_depth=with_depth)
+        return self._networks[key]
 
 
 class _Rays(NamedTuple):
@@ -105,16 +195,6 @@ class _Rays(NamedTuple):
     direction: Float32  # (R, 3)
     z: Float32  # (R, N) ascending
     own_factor: Float32  # (R,) times which the own view's weight counts, of tokens at the surface
-
-
-class _SourceMaps(NamedTuple):
-    feature: Float32  # (m, h, w, C)
-    rgb: Float32  # (m, h, w, 3)
-    geometry: Float32  # (m, h, w, 5)
-    log_scale: Float32  # (m, h, w) logarithm of the first scale, which is a cue
-    K: Float32  # (m, 4) fx fy cx cy
-    T_camera_world: Float32  # (m, 3, 4)
-    labels: NDArray[np.int16]  # (m, H, W) known labels, -1 = none; (m, 0, 0) where no view has any
 
 
 class _Settings(NamedTuple):
@@ -167,70 +247,71 @@ class _Rendered(NamedTuple):
 
 @parallel_kernel(chunks_per_thread=4)
 def render_sray(
-    count: int, rays: _Rays, maps: _SourceMaps, settings: _Settings, weights: _Weights, out: _Rendered
+    count: int, rays: _Rays, maps: StreamedViews, settings: _Settings, weights: _Weights, out: _Rendered
 ) -> None:
     """Render ``count`` rays into ``out``, before the classifier; see ``SRay.render_samples``."""
 
 
-def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:
-    """The maps as the kernel takes them: without a copy where they are channels-last.
-    Raises ShapeError: maps that do not fit together, or not the model."""
-    sizes = expect_shape(sources.feature, f"M {channels} H W", "source features")
-    m, h, w = sizes["M"], sizes["H"], sizes["W"]
-    expect_shape(sources.rgb, f"{m} 3 {h} {w}", "source rgb")
-    expect_shape(sources.geometry, f"{m} {GEOMETRY_CHANNELS} {h} {w}", "source geometry")
-    expect_shape(sources.K, f"{m} 3 3", "source K")
-    expect_shape(sources.T_camera_world, f"{m} 4 4", "source T_camera_world")
-    expect_shape(sources.channel, f"{m} H W", "source channel")
-    labels = sources.channel if (sources.channel >= 0).any() else sources.channel[:, :0, :0]
-    K = sources.K
-    return _SourceMaps(
-        _array(sources.feature.permute(0, 2, 3, 1)),
-        _array(sources.rgb.permute(0, 2, 3, 1)),
-        _array(sources.geometry.permute(0, 2, 3, 1)),
-        _array(sources.geometry[:, 1].log()),
-        _array(torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), dim=1)),
-        _array(sources.T_camera_world[:, :3]),
-        labels.to(torch.int16).contiguous().numpy(),
-    )
+def _check_views(sources: StreamedViews, channels: int) -> None:
+    sizes = expect_shape(sources.feature, f"M h w {channels}", "source features")
+    count, size = sizes["M"], f"{sizes['M']} {sizes['h']} {sizes['w']}"
+    expect_shape(sources.rgb, f"{size} 3", "source rgb")
+    expect_shape(sources.geometry, f"{size} {GEOMETRY_CHANNELS}", "source geometry")
+    expect_shape(sources.log_scale, size, "source log_scale")
+    expect_shape(sources.K, f"{count} 4", "source K")
+    expect_shape(sources.T_camera_world, f"{count} 3 4", "source T_camera_world")
+    expect_shape(sources.channel, f"{count} H W", "source channel")
 
 
-def _pack_weights(model: SRay) -> _Weights:
-    off = _Attention(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32))
-    config, density = model.config, model.density
+def _inverse(T_world_camera: Float64) -> Float32:
+    """(1, 3, 4)."""
+    return np.ascontiguousarray(invert_pose(T_world_camera)[None, :3], np.float32)
+
+
+def _aligned(rows: int, columns: int) -> Float32:
+    """An empty matrix that begins at a multiple of ``ALIGNMENT``."""
+    memory = np.empty(4 * rows * columns + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    return memory[start : start + 4 * rows * columns].view(np.float32).reshape(rows, columns)
+
+
+def _pack_weights(tensors: Tensors, config: SRayConfig, classes: int) -> _Weights:
+    """Raises KeyError: a tensor is missing; its name. ShapeError: one is of another shape."""
+    dim, values = config.feature_dim, config.feature_dim + (3 if config.tokens == "surface" else 0)
+    cues = SURFACE_CUES if config.tokens == "surface" else CUES
+
+    def matrix(name: str, out: int, size: int) -> Float32:
+        expect_shape(tensors[name], f"{out} {size}", f"'{name}'")
+        return np.ascontiguousarray(tensors[name], np.float32)
+
+    def transposed(name: str, out: int, size: int) -> Float32:
+        return np.ascontiguousarray(matrix(name, out, size).T)
+
+    def layer(name: str, out: int, size: int) -> _Layer:
+        expect_shape(tensors[f"{name}.bias"], f"{out}", f"'{name}.bias'")
+        weight = f"{name}.weight"
+        two = out == 2  # outputs, which C takes by rows
+        return _Layer((matrix if two else transposed)(weight, out, size), tensors[f"{name}.bias"].astype(np.float32))
+
+    def attention(name: str, there: bool) -> _Attention:
+        none = np.zeros((0, 0), np.float32)
+        if not there:
+            return _Attention(none, none)
+        return _Attention(transposed(f"{name}.qkv.weight", 3 * dim, dim), transposed(f"{name}.out.weight", dim, dim))
+
+    matrix("classifier.weight", classes, dim)
+    expect_shape(tensors["classifier.bias"], f"{classes}", "'classifier.bias'")
+    _ = tensors["label_logit"], tensors["own_view_factor"] if config.tokens == "surface" else None
     return _Weights(
-        radial=_attention(model.radial) if config.intra_view_attention else off,
-        cross=_attention(model.cross) if config.cross_view_attention else off,
-        view_hidden=_layer(model.weights.net[0]),
-        view_scores=_two_outputs(model.weights.net[2]),
-        density_hidden=_layer(density.token[0]),
-        density_token=_layer(density.token[2]),
-        density_qkv=_transposed(density.qkv),
-        density_out_hidden=_layer(density.out[0]),
-        density_out=_two_outputs(density.out[2]),
-        semantic_hidden=_layer(model.semantic[0]),
-        semantic_out=_layer(model.semantic[2]),
+        radial=attention("radial", config.intra_view_attention),
+        cross=attention("cross", config.cross_view_attention),
+        view_hidden=layer("weights.net.0", 16, dim + cues),
+        view_scores=layer("weights.net.2", 2, 16),
+        density_hidden=layer("density.token.0", 32, 2 * values + 4),
+        density_token=layer("density.token.2", 16, 32),
+        density_qkv=transposed("density.qkv.weight", 48, 16),
+        density_out_hidden=layer("density.out.0", 16, 16),
+        density_out=layer("density.out.2", 2, 16),
+        semantic_hidden=layer("semantic.0", 2 * dim, dim),
+        semantic_out=layer("semantic.2", dim, 2 * dim),
     )
-
-
-def _array(tensor: torch.Tensor) -> Float32:
-    return tensor.detach().float().contiguous().numpy()
-
-
-def _transposed(layer: nn.Module) -> Float32:
-    assert isinstance(layer, nn.Linear)
-    return np.ascontiguousarray(layer.weight.detach().float().cpu().numpy().T)
-
-
-def _attention(layer: MultiHeadAttention) -> _Attention:
-    return _Attention(_transposed(layer.qkv), _transposed(layer.out))
-
-
-def _layer(layer: nn.Module) -> _Layer:
-    assert isinstance(layer, nn.Linear)
-    return _Layer(_transposed(layer), _array(layer.bias).copy())
-
-
-def _two_outputs(layer: nn.Module) -> _Layer:
-    assert isinstance(layer, nn.Linear)
-    return _Layer(_array(layer.weight).copy(), _array(layer.bias).copy())

@@ -14,9 +14,9 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import SamplingConfig, UNetFieldConfig
-from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views, gather, own_view, reproject
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.views import EncodedViews, check_views, encoded_views, gather, own_view, reproject
 from semantic_mapper.fields.volume import field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews

@@ -5,15 +5,14 @@ Sample positions are ascending z depths (R, N) in metres.
 
 from __future__ import annotations
 
-import msgspec
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
 import torch
 
 from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.sampling import guided_samples
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.types import FieldRender, RayBatch
-
-COMPUTED_GUIDED = 8  # samples round a depth prior that was computed from pictures
-COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
 
 
 def sample_inverse_depth(
@@ -32,31 +31,9 @@ def sample_inverse_depth(
 
 
 def sample_guided(rays: RayBatch, config: SamplingConfig) -> torch.Tensor:
-    """Samples round the depth prior of each ray; uniform in inverse depth for rays without one. ``free_space`` of them
-    lie between near and the guided interval: they find what stands before a prior that is out of date."""
-    prior = rays.prior_depth_m
-    has_prior = prior > 0
-    z_prior = torch.where(has_prior, prior, torch.ones_like(prior))
-    half = config.guided_sigma * z_prior + config.guided_floor_m
-    count = config.guided - config.free_space
-    offset = torch.linspace(-1, 1, count, dtype=prior.dtype, device=prior.device)
-    start = torch.maximum(z_prior - half, rays.near_m * 0.5)
-    around = start[:, None] + (offset[None, :] + 1) * half[:, None]
-    if config.free_space > 0:
-        near = torch.minimum(rays.near_m, start * 0.5)
-        before = sample_inverse_depth(near, start, config.free_space)
-        around = torch.cat((before, around), dim=1)
-    blind = sample_inverse_depth(rays.near_m, rays.far_m, config.guided)
-    return torch.where(has_prior[:, None], around, blind)
-
-
-def around_computed(config: SamplingConfig) -> SamplingConfig:
-    """The settings for depth priors that were computed from pictures: these may be farther off than a sensor's."""
-    return msgspec.structs.replace(
-        config,
-        guided=max(COMPUTED_GUIDED, config.guided),
-        guided_sigma=max(COMPUTED_SIGMA, config.guided_sigma),
-    )
+    """``guided_samples`` of rays."""
+    prior, near, far = (each.cpu().numpy() for each in (rays.prior_depth_m, rays.near_m, rays.far_m))
+    return torch.from_numpy(guided_samples(prior, near, far, config)).to(rays.prior_depth_m.device)
 
 
 def sample_from_weights(z: torch.Tensor, weights: torch.Tensor, count: int) -> torch.Tensor:

@@ -189,7 +189,7 @@ class ParallelKernel(Generic[P]):
     def __call__(self, count: int, /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Run iterations 0 to ``count`` on as many threads as torch uses, this one included; returns when all ended."""
         packed = self._kernel.pack(*args, **kwargs)
-        threads = min(_thread_count(), count)
+        threads = min(thread_count(), count)
         if threads <= 1:
             self._run(0, count, packed)
             return
@@ -230,7 +230,8 @@ def parallel_kernel(
     return decorate
 
 
-def _thread_count() -> int:
+def thread_count() -> int:
+    """As many as torch uses, or would use."""
     # None where torch is not loaded; without the function while another thread is just loading it.
     return getattr(sys.modules.get("torch"), "get_num_threads", _count_of_environment)()
 

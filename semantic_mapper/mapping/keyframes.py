@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from semantic_mapper.config import KeyframeConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.base import Encoded, EncodedSize
 from semantic_mapper.geometry import (
     GUESSED_DEPTHS_M,
     LABELLED_VALUE,
@@ -19,13 +18,11 @@ from semantic_mapper.geometry import (
     visible_points,
 )
 from semantic_mapper.localization.places import view_distances
-from semantic_mapper.rays import invert_pose_torch
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 ROTATION_DEG = 12.0  # that a frame has turned from every keyframe near it, to become one
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
-EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # see ``EncodedViews.size``
 HERE_M = 6.0  # from the newest keyframe: beyond, others are worth less, by the square of the distance
 
 
@@ -38,7 +35,7 @@ class Keyframe:
     T_world_camera: Float64  # (4, 4) float64
     intrinsics: CameraIntrinsics  # of ``depth_m``
     depth_m: Float32  # (h, w) float32, small, 0 = none
-    encoded: EncodedViews  # one view
+    encoded: Encoded  # one view
     labelled: bool = False  # the field was finetuned on this view; such keyframes are never dropped
     camera_id: str = ""
 
@@ -83,10 +80,7 @@ class KeyframeStore:
         for i, keyframe in enumerate(self._keyframes):
             pose = poses.get((keyframe.camera_id, keyframe.stamp_ns))
             if pose is not None and not np.array_equal(pose, keyframe.T_world_camera):
-                like = keyframe.encoded.T_camera_world
-                T_camera_world = invert_pose_torch(torch.tensor(pose, dtype=like.dtype, device=like.device)[None])
-                encoded = replace(keyframe.encoded, T_camera_world=T_camera_world)
-                self._keyframes[i] = replace(keyframe, T_world_camera=pose, encoded=encoded)
+                self._keyframes[i] = replace(keyframe, T_world_camera=pose, encoded=keyframe.encoded.at(pose))
                 moved += 1
         return moved
 

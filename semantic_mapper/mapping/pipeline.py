@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import cv2
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
-from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
+from semantic_mapper.fields.base import Encoded, StreamField, WorkingView, check_classes
 from semantic_mapper.fields.domain_check import DomainCheck
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import View
-from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
+from semantic_mapper.geometry import check_pose, scale_intrinsics
 from semantic_mapper.imaging import (
     FrameViews,
     depth_prior,
@@ -42,7 +40,7 @@ from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, upsample
 from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualView, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, SourceViews, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
@@ -76,7 +74,7 @@ class MappingPipeline:
     ``WeightsError``: the field renders other classes than the map holds."""
 
     def __init__(
-        self, config: MapperConfig, field: SemanticField, label_set: LabelSet, *, anchors: Sequence[PosedFrame] = ()
+        self, config: MapperConfig, field: StreamField[Any], label_set: LabelSet, *, anchors: Sequence[PosedFrame] = ()
     ) -> None:
         check_classes(field, label_set)
         self.config = config = with_quality(config)
@@ -162,10 +160,10 @@ class MappingPipeline:
         if anchor.label is not None:
             width = self.config.render.encode_width or anchor.intrinsics.width
             label = resize_label(anchor.label, working_intrinsics(anchor.intrinsics, width))
-            channel = torch.from_numpy(self.label_set.to_channels(label, f"anchor seq={anchor.seq}"))[None]
+            channel = self.label_set.to_channels(label, f"anchor seq={anchor.seq}")
         return self._make_keyframe(views, self._encode(views, channel), labelled=True)
 
-    def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
+    def exchange_field(self, field: StreamField[Any], anchors: Sequence[Keyframe]) -> None:
         """Go on with other weights, which encode as the present ones do, and the anchors of ``encode_anchor`` in place
         of those before; what is in the map stays. ``WeightsError``: it renders other classes; nothing has changed."""
         check_classes(field, self.label_set)
@@ -216,25 +214,16 @@ class MappingPipeline:
             )
         return frame
 
-    def _encode(self, resized: FrameViews, channel: torch.Tensor | None = None) -> EncodedViews:
-        """Encode one frame at working width; ``channel`` (1, h, w) are labels of a keyframe that the field was
+    def _encode(self, resized: FrameViews, channel: NDArray[np.integer] | None = None) -> Encoded:
+        """Encode one frame at working width; ``channel`` (h, w) are labels of a keyframe that the field was
         finetuned on."""
         frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
-        rgb, depth = resized.rgb(intrinsics), resized.depth(intrinsics)
         spread = resize_spread(frame, intrinsics)  # a field that has not learned from computed depth leaves it out
-        views = SourceViews(
-            rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
-            depth_m=torch.from_numpy(depth)[None],
-            K=torch.from_numpy(camera_matrix(intrinsics)).float()[None],
-            T_world_camera=torch.tensor(frame.T_world_camera, dtype=torch.float32)[None],
-            channel=channel,
-            depth_sigma_m=None if spread is None else torch.from_numpy(spread)[None],
-        )
-        with torch.inference_mode():
-            return self.field.encode(views)
+        images = resized.rgb(intrinsics), resized.depth(intrinsics)
+        return self.field.encode(WorkingView(*images, intrinsics, frame.T_world_camera, channel, spread))
 
-    def _choose_sources(self, views: FrameViews, current: EncodedViews, keyframes: KeyframeStore) -> list[Keyframe]:
+    def _choose_sources(self, views: FrameViews, current: Encoded, keyframes: KeyframeStore) -> list[Keyframe]:
         """Keyframes to render a frame from, of its size: cameras of another shape have feature maps of another size."""
         intrinsics = working_intrinsics(views.frame.intrinsics, COVERAGE_WIDTH)
         count = self.config.keyframes.source_views - int(self.config.keyframes.use_current_view)
@@ -243,12 +232,12 @@ class MappingPipeline:
             chosen = [k for k in keyframes.keyframes if k.encoded.size == current.size][-1:]
         return chosen
 
-    def _with_own(self, sources: Sequence[Keyframe], current: EncodedViews) -> list[EncodedViews]:
+    def _with_own(self, sources: Sequence[Keyframe], current: Encoded) -> list[Encoded]:
         """Source views as they are rendered from, the frame itself among them where the settings say so."""
         return [*(k.encoded for k in sources), *([current] if self.config.keyframes.use_current_view else [])]
 
     def _render_semantics(
-        self, views: FrameViews, sources: Sequence[Keyframe], current: EncodedViews
+        self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded
     ) -> tuple[RenderedView, RenderedView]:
         """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself."""
         view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
@@ -256,9 +245,7 @@ class MappingPipeline:
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
         return view, add_own_image(view, self.field, current, weight)
 
-    def _render(
-        self, views: FrameViews, sources: list[EncodedViews], scale: float, renderer: ViewRenderer
-    ) -> RenderedView:
+    def _render(self, views: FrameViews, sources: list[Encoded], scale: float, renderer: ViewRenderer) -> RenderedView:
         """The view (h, w), ``scale`` times the size of the frame."""
         frame = views.frame
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
@@ -267,9 +254,8 @@ class MappingPipeline:
             return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(views, intrinsics)
-        view = View(
-            renderer.field,
-            stack_views(sources),
+        return renderer.render(
+            self.field.stack(sources),
             intrinsics,
             frame.T_world_camera,
             prior,
@@ -281,7 +267,7 @@ class MappingPipeline:
 
     @property
     def _holds_scene(self) -> bool:
-        return isinstance(self.field, LearnedField) and self.field.holds_scene
+        return self.field.holds_scene
 
     def _depth_prior(self, views: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast; nowhere,
@@ -335,7 +321,7 @@ class MappingPipeline:
         """Integrate a frame of the history into a map."""
         self._fuse(voxel_map, self._upsample(FrameViews(frame), view, voxel_map), view)
 
-    def _keep_view(self, views: FrameViews, current: EncodedViews, sources: Sequence[Keyframe]) -> bool:
+    def _keep_view(self, views: FrameViews, current: Encoded, sources: Sequence[Keyframe]) -> bool:
         """Keep a frame as a source view (whether it became one), and as a place, where it shows something new."""
         frame = views.frame
         is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
@@ -351,7 +337,7 @@ class MappingPipeline:
             places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
         return is_keyframe
 
-    def _make_keyframe(self, views: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
+    def _make_keyframe(self, views: FrameViews, encoded: Encoded, *, labelled: bool = False) -> Keyframe:
         frame = views.frame
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
         depth = views.depth(intrinsics)
@@ -438,14 +424,14 @@ class MappingPipeline:
 class FieldTrial:
     """A field that may take the place of a pipeline's, which goes on mapping meanwhile: looked at in small pieces.
 
-    ``field`` encodes as the present one does (``fields.learned.encode_alike``); ``anchors`` are labelled keyframes that
+    ``field`` encodes as the present one does (``fields.weights.encode_alike``); ``anchors`` are labelled keyframes that
     it was finetuned on; in ``frames``, mapped ones, it is compared with the map. ``WeightsError``: other classes than
     the map's, or more anchors than the pipeline keeps keyframes."""
 
     def __init__(
         self,
         pipeline: MappingPipeline,
-        field: SemanticField,
+        field: StreamField[Any],
         anchors: Sequence[PosedFrame],
         frames: Sequence[PosedFrame],
     ) -> None:

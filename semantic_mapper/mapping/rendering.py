@@ -6,20 +6,17 @@ of probabilities a pixel."""
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false
-from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import msgspec
 import numpy as np
-import torch
-from torch.nn import functional
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
-from semantic_mapper.fields.base import EncodedViews, SemanticField
-from semantic_mapper.fields.render import View, render_sparse_view, render_view
-from semantic_mapper.fields.volume import around_computed
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.base import Sampled, StreamField
+from semantic_mapper.fields.render import View, render_sparse_view, render_view, softmax
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion import PROBABILITY_FLOOR
@@ -46,7 +43,7 @@ class RenderedView(NamedTuple):
 class ViewRenderer:
     """Renders views from one field."""
 
-    def __init__(self, field: SemanticField, config: RenderConfig, sampling: SamplingConfig) -> None:
+    def __init__(self, field: StreamField[Any], config: RenderConfig, sampling: SamplingConfig) -> None:
         self.field = field  # may be exchanged for one of the same kind
         self._config = config
         self._sampling = sampling
@@ -60,8 +57,19 @@ class ViewRenderer:
         if self._rate_controller is not None:
             self._rate_controller.note(render_ms, other_ms, *self._last)
 
-    def render(self, view: View, rgb: UInt8, *, computed: bool = False) -> RenderedView:
-        """Render a view (h, w) of the field, with samples as the settings, or the rate to hold, say.
+    def render(
+        self,
+        sources: Any,
+        intrinsics: CameraIntrinsics,
+        T_world_camera: Float64,
+        prior_m: Float32,
+        rgb: UInt8,
+        *,
+        measured: Bool | None = None,
+        computed: bool = False,
+        stamp_ns: int | None = None,
+    ) -> RenderedView:
+        """Render one view, (h, w), from sources at a pose (4, 4).
 
         ``rgb`` is (h, w, 3) uint8; ``computed``: the depth prior was computed from pictures and may be farther off."""
         prior_m = view.prior_depth_m
@@ -87,21 +95,18 @@ class ViewRenderer:
         return RenderedView(probabilities, known, depth_m, rays, samples)
 
 
-def add_own_image(view: RenderedView, field: SemanticField, current: EncodedViews, weight: float) -> RenderedView:
+def add_own_image(view: RenderedView, field: StreamField[Any], current: Any, weight: float) -> RenderedView:
     """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it is
     known; the view itself where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
-    if weight == 0:
+    own = field.source_logits(current) if weight else None
+    if own is None:
         return view
-    with torch.inference_mode():
-        logits = field.source_logits(current)
-        if logits is None:
-            return view
-        own = logits.float().cpu()
-        if own.shape[2:] != view.known.shape:
-            own = functional.interpolate(own, size=view.known.shape, mode="bilinear", align_corners=False)
-        own = torch.log_softmax(own[0].permute(1, 2, 0), dim=-1).clamp_min(float(np.log(PROBABILITY_FLOOR)))
-        rendered = torch.from_numpy(view.probabilities).clamp_min(PROBABILITY_FLOOR).log()
-        joined = torch.softmax(weight * own + (1 - weight) * rendered, dim=-1).numpy()
+    height, width = view.known.shape
+    if own.shape[:2] != view.known.shape:
+        own = np.asarray(cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    own = np.log(np.maximum(softmax(own), PROBABILITY_FLOOR))
+    rendered = np.log(np.maximum(view.probabilities, PROBABILITY_FLOOR))
+    joined = softmax((weight * own + (1 - weight) * rendered).astype(np.float32, copy=False))
     return view._replace(probabilities=np.where(view.known[..., None], joined, view.probabilities))
 
 

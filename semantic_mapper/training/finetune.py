@@ -19,8 +19,7 @@ import torch
 
 from semantic_mapper.config import SamplingConfig, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model
 from semantic_mapper.fields.device import choose_device, encoder_in_bfloat16, to_device
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
@@ -28,7 +27,9 @@ from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.fields.volume import sample_guided
+from semantic_mapper.fields.weights import anchor_from_frame
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.config import FinetuneConfig, StepConfig

@@ -16,9 +16,10 @@ import torch
 
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, SegmentationMetrics
-from semantic_mapper.fields.base import stack_views
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.learned import LearnedField, encode_alike
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.views import stack_views
+from semantic_mapper.fields.weights import ENCODING_PARTS
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.config import OnlineConfig
@@ -187,7 +188,7 @@ def learn(
     if len(train) < 2 or not held_out:
         raise FrameError(f"learning needs 2 keyframes, and 1 to judge by, got {len(train)} and {len(held_out)}")
     encoder = current.model.image_encoder
-    if not encode_alike(current.model, current.model) or encoder is None or encoder.uncalibrated:
+    if current.model.kind not in ENCODING_PARTS or encoder is None or encoder.uncalibrated:
         raise WeightsError(
             f"these weights (kind '{current.model.kind}') cannot be finetuned with a frozen encoder: start from "
             "trained S-Ray weights"

@@ -10,8 +10,9 @@ import torch
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import FrameError, PoseError
-from semantic_mapper.fields.base import UNSURE_SPREAD
-from semantic_mapper.fields.volume import around_computed, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.numbers import UNSURE_SPREAD
+from semantic_mapper.fields.sampling import around_computed
+from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
 from semantic_mapper.geometry import GUESSED_DEPTHS_M, camera_matrix, check_pose, transform, unproject, visible_points
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet

@@ -24,7 +24,7 @@ from unittest.mock import patch
 
 from semantic_mapper import errors
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.queries.questions import (
     QUESTIONS,
     decode_answer,

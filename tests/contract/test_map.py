@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.fields.weights import default_checkpoint_path
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, POINTS, REFUSED_SEQ, WEIGHTS, digest, form, lacking, read
 from tests.contract.runs import (

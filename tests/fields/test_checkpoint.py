@@ -8,15 +8,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from semantic_mapper.errors import WeightsError
-from semantic_mapper.fields.checkpoint import (
-    COMPUTED_DEPTH,
-    Checkpoint,
-    anchor_from_frame,
-    default_checkpoint_path,
-    find_checkpoint,
-    load_checkpoint,
-    save_checkpoint,
-)
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.weights import COMPUTED_DEPTH, anchor_from_frame, default_checkpoint_path, find_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
 from tests.small import tiny_field, tiny_frames

@@ -4,9 +4,10 @@ import torch
 
 from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.render import View, render_sparse_view, render_view
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.mapper import make_field
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from research.scenes import TRAIN_SEEDS, room_frames
-from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, streaming
 from semantic_mapper.fields.domain_check import find_domain_check
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.artifacts import finish_session
@@ -32,7 +31,7 @@ def test_meadows_are_unlike_rooms_and_it_is_said_live_and_in_the_summary(tmp_pat
         assert len(said) == bool(unlike) and all("5 of 5 pictures" in s and "finetune" in s for s in said)
         assert any("5 of 5" in warning for warning in session.warnings) == bool(unlike)
         check = session.pipeline.domain_check
-        session.pipeline.exchange_field(StreamingSRay(session.mapper.checkpoint.model), ())
+        session.pipeline.exchange_field(streaming(session.mapper.checkpoint.model), ())
         assert check is not None and session.pipeline.domain_check is None, "weights fitted to this place know it"
 
 

@@ -11,11 +11,8 @@ import torch
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.encoder import (
-    ImageEncoder,
-    calibrate,
-    surface_maps,
-)
+from semantic_mapper.fields.encoder import ImageEncoder, calibrate
+from semantic_mapper.fields.surface_maps import surface_maps
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.types import CameraIntrinsics, SourceViews
 from tests.fields.scene import pose_at, wall_sources

@@ -4,7 +4,8 @@ import torch
 from semantic_mapper.config import SRayConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.learned import KINDS, build_field
+from semantic_mapper.fields.kinds import KINDS
+from semantic_mapper.fields.learned import build_field
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.config import StepConfig
 from semantic_mapper.training.finetune import step_on_rays

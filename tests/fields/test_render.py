@@ -6,12 +6,12 @@ import torch
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.render import (
     View,
     render_sparse_view,
     render_view,
 )
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import CameraIntrinsics, FieldRender, RayBatch
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
-from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.scene.grid import (
     NOTHING,
@@ -13,6 +12,7 @@ from semantic_mapper.fields.scene.grid import (
     RaySamples,
     at_resolution,
 )
+from semantic_mapper.fields.views import EncodedViews
 from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, assert_unknown
 

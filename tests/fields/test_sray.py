@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.base import EncodedViews, gather, reproject, stack_views
 from semantic_mapper.fields.sray import SRay, contextual_space, hit_and_visibility, surface_space
-from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.views import EncodedViews, gather, reproject, stack_views
 from semantic_mapper.fields.volume import compositing_weights, sample_inverse_depth
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
@@ -160,7 +159,7 @@ def rendered(
     """By the field or by its compiled renderer; and what the views say by themselves."""
     with torch.no_grad():
         slow = field.render_samples(rays, z, encoded)[0]
-        render = StreamingSRay(field).render_samples(rays, z, encoded) if streaming else slow
+        render = streaming(field).render_samples(rays, z, encoded) if streaming else slow
         return render, field.source_logits(encoded)
 
 

@@ -11,8 +11,8 @@ import torch
 
 from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError
+from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
@@ -47,7 +47,7 @@ def labelled(views: SourceViews) -> SourceViews:
 def render_both(
     field: SRay, views: SourceViews, rays: RayBatch, z: torch.Tensor, least: float = 0.0
 ) -> tuple[FieldRender, FieldRender]:
-    streaming = StreamingSRay(field)
+    streaming = streaming(field)
     encoded = streaming.encode(views)
     with torch.inference_mode():
         reference, _ = field.render_samples(rays, z, encoded, least)
@@ -106,12 +106,12 @@ def test_it_prunes_the_same_samples(least: float, heads: int):
     # All of the ray's weight still says something, and geometry is what it was.
     assert torch.equal(reference.opacity, whole.opacity) and torch.equal(reference.depth_m, whole.depth_m)
     assert 1e-4 < (reference.logits - whole.logits).abs().max() < 20 * least
-    assert_equal(StreamingSRay(field).render_samples(rays, z, encoded, least), reference)
+    assert_equal(streaming(field).render_samples(rays, z, encoded, least), reference)
 
 
 @pytest.mark.parametrize("heads", [2, 4])
 def test_a_broken_pixel_breaks_the_rays_that_look_at_it_and_no_others(heads: int):
-    streaming = StreamingSRay(random_field(feature_dim=32, heads=heads))
+    streaming = streaming(random_field(feature_dim=32, heads=heads))
     encoded, rays = streaming.encode(wall_sources(POSES)), wall_rays(pose_at(0.1), step=2)
     whole = streaming.render(rays, encoded).logits
     for value in (float("nan"), float("inf")):
@@ -124,7 +124,7 @@ def test_a_broken_pixel_breaks_the_rays_that_look_at_it_and_no_others(heads: int
 
 
 def test_the_same_bits_in_every_run_and_on_any_number_of_threads():
-    streaming = StreamingSRay(random_field(feature_dim=32, heads=4))
+    streaming = streaming(random_field(feature_dim=32, heads=4))
     encoded = streaming.encode(labelled(wall_sources(POSES)))
     rays = wall_rays(pose_at(0.1), step=3)
     renders: list[FieldRender] = []
@@ -136,7 +136,7 @@ def test_the_same_bits_in_every_run_and_on_any_number_of_threads():
 
 
 def test_maps_that_do_not_fit_are_refused():
-    streaming, rays = StreamingSRay(random_field()), wall_rays(pose_at(0.1), step=5)
+    streaming, rays = streaming(random_field()), wall_rays(pose_at(0.1), step=5)
     encoded = streaming.encode(labelled(wall_sources(POSES)))
     for name in ("rgb", "geometry", "K", "T_camera_world", "channel"):
         with pytest.raises(ShapeError, match=f"source {name}"):

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semantic_mapper.errors import MapError, PoseError
-from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction import ALWAYS, PoseCorrection, PosePair
@@ -29,7 +29,8 @@ def make_pipeline(max_frames: int = 100, **changes: object) -> MappingPipeline:
         "keyframes": {"source_views": 2, "translation_m": 0.1},
         "history": {"max_frames": max_frames},
     }
-    return tiny_pipeline(**{**base, **changes})
+    config = tiny_config(**{**base, **changes})
+    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
 
 
 def mapped(frames: list[PosedFrame] | tuple[PosedFrame, ...], **changes: object) -> MappingPipeline:
@@ -142,7 +143,7 @@ def test_keyframes_move_with_their_frames_and_anchors_of_another_recording_stay(
     config = make_pipeline().config
     foreign = replace(tiny_frames(2, 8)[1], stamp_ns=5)
     anchors = (foreign, replace(late[2], T_world_camera=late[2].T_world_camera.copy()))
-    pipeline = MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS, anchors=anchors)
+    pipeline = MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS, anchors=anchors)
     for frame in late:
         pipeline.step(frame)
     before = pipeline.keyframes.keyframes

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
@@ -48,7 +49,8 @@ def without_depth(frames: Sequence[PosedFrame]) -> list[PosedFrame]:
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
-    return tiny_pipeline(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
+    config = tiny_config(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
+    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
 
 
 def mapped(frames: Sequence[PosedFrame], **changes: object) -> MappingPipeline:

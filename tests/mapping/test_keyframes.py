@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from semantic_mapper.config import KeyframeConfig
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore, pose_distances
 from semantic_mapper.types import CameraIntrinsics

@@ -8,15 +8,25 @@ import pytest
 
 from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
-from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint, streaming
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
 from semantic_mapper.types import PosedFrame
-from tests.mapping.test_voxel_map import same
-from tests.small import tiny_config, tiny_field, tiny_frames, tiny_pipeline
+from tests.small import tiny_config, tiny_field, tiny_frames
+
+
+def make_pipeline(**changes: object) -> MappingPipeline:
+    config = tiny_config(**changes)
+    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+
+
+def same_map(a: MappingPipeline, b: MappingPipeline) -> bool:
+    x, y = a.voxel_map.block_state(), b.voxel_map.block_state()
+    return all(np.array_equal(x[k], y[k]) for k in x)
 
 
 @pytest.mark.parametrize("value", [1e-40, 1e4, 1e30, 3.4e38, np.inf, np.nan, -1.0])
@@ -119,7 +129,7 @@ def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
         ([replace(f, label=None) for f in frames[:2]], frames[2:4]),
         (frames[:2], [replace(f, label=None) for f in frames[2:4]]),
     ):
-        pipeline = MappingPipeline(config, StreamingSRay(field), ROOMS, anchors=anchors)
+        pipeline = MappingPipeline(config, streaming(field), ROOMS, anchors=anchors)
         for frame in stream:
             pipeline.step(frame)
         maps.append(pipeline)
@@ -160,7 +170,7 @@ FRAMES = tiny_frames(6)
 
 
 def mapped(count: int = 4) -> MappingPipeline:
-    pipeline = tiny_pipeline(keyframes={"translation_m": 0.01})
+    pipeline = MappingPipeline(tiny_config(keyframes={"translation_m": 0.01}), streaming(tiny_field()), ROOMS)
     for frame in FRAMES[:count]:
         pipeline.step(dataclasses.replace(frame, label=None))
     return pipeline
@@ -172,9 +182,9 @@ def test_an_exchanged_field_goes_on_with_map_and_keyframes_as_they_are(monkeypat
     before, keyframes = pipeline.voxel_map.block_state(), pipeline.keyframes.keyframes
     assert len(keyframes) == 4
     anchors = [FRAMES[4], FRAMES[5]]
-    alike = FieldTrial(pipeline, StreamingSRay(tiny_field()), (), [FRAMES[0], FRAMES[1]])
-    assert [alike.advance() for _ in range(2)] == [False, True]
-    trial = FieldTrial(pipeline, StreamingSRay(tiny_field()), anchors, [FRAMES[0], FRAMES[1]])
+    same = FieldTrial(pipeline, streaming(tiny_field()), (), [FRAMES[0], FRAMES[1]])
+    assert [same.advance() for _ in range(2)] == [False, True]
+    trial = FieldTrial(pipeline, streaming(tiny_field()), anchors, [FRAMES[0], FRAMES[1]])
     assert [trial.advance() for _ in range(4)] == [False, False, False, True]
     # What the map says comes from the same random weights; those that know labels of two views say otherwise.
     assert alike.agreement is not None and trial.agreement is not None and alike.agreement > 2 * trial.agreement
@@ -186,7 +196,7 @@ def test_an_exchanged_field_goes_on_with_map_and_keyframes_as_they_are(monkeypat
     assert same(pipeline.voxel_map.block_state(), before)
     update = pipeline.step(dataclasses.replace(FRAMES[4], label=None))
     assert update.fused and {4, 5} & set(update.source_seqs)
-    trial = FieldTrial(pipeline, StreamingSRay(tiny_field()), anchors[:1], [])
+    trial = FieldTrial(pipeline, streaming(tiny_field()), anchors[:1], [])
     assert trial.advance() and trial.agreement is None
     trial.exchange()  # labelled keyframes of the weights before go with them
     assert [k.seq for k in pipeline.keyframes.keyframes if k.labelled] == [FRAMES[4].seq]
@@ -195,9 +205,9 @@ def test_an_exchanged_field_goes_on_with_map_and_keyframes_as_they_are(monkeypat
 def test_what_does_not_fit_the_pipeline_is_refused() -> None:
     pipeline = mapped(1)
     with pytest.raises(WeightsError, match="label set 'nyu40'"):
-        FieldTrial(pipeline, StreamingSRay(tiny_field(NYU40)), (), ())
+        FieldTrial(pipeline, streaming(tiny_field(NYU40)), (), ())
     with pytest.raises(WeightsError, match="65 keyframes come with these weights, but only 64 are kept"):
-        FieldTrial(pipeline, StreamingSRay(tiny_field()), [FRAMES[0]] * 65, ())
+        FieldTrial(pipeline, streaming(tiny_field()), [FRAMES[0]] * 65, ())
 
 
 def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import LabelError
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.weights import anchor_from_frame
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper

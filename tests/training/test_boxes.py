@@ -13,10 +13,10 @@ import torch
 
 from semantic_mapper.config import PanopticConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import encoded_views
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
 from semantic_mapper.fields.scene.primitives import Primitive
+from semantic_mapper.fields.views import encoded_views
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.finetune import finetune
 from semantic_mapper.training.views import frame_rays, stack_sources, view_from_frame

@@ -12,7 +12,8 @@ import torch
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.learned import build_field, encode_alike
+from semantic_mapper.fields.learned import build_field
+from semantic_mapper.fields.weights import encode_alike
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.training.config import OnlineConfig
 from semantic_mapper.training.online import KeyframePool, KeyframeSplit, key_of, learn

@@ -13,10 +13,10 @@ import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
-from semantic_mapper.fields.base import encoded_views
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.scene.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
 from semantic_mapper.fields.scene.primitives import Primitive
+from semantic_mapper.fields.views import encoded_views
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.training.config import FinetuneConfig, GridFitConfig, PanopticFitConfig, StepConfig
 from semantic_mapper.training.finetune import finetune

@@ -7,8 +7,7 @@ import torch
 import research.bench.render as bench
 from research.bench.render import bench_render, log_scenes, room_scenes
 from semantic_mapper.errors import LogError
-from semantic_mapper.fields.checkpoint import Checkpoint
-from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.checkpoint import Checkpoint, streaming
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.rendering import ViewRenderer
@@ -43,7 +42,7 @@ def test_the_renderer_is_asked_as_the_mapper_asks_it(monkeypatch: pytest.MonkeyP
     holes[20:40, 30:60] = 0
     scene = replace(scene, query=replace(scene.query, depth_m=holes))
     config = tiny_config(render={"scale": 1.0})
-    MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS).step(scene.query)
+    MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS).step(scene.query)
     bench_render(Checkpoint(tiny_field()), [scene], repeats=0, reference_rays=64)
     (prior, measured), *others = asked
     assert len(others) == 2 and 0 < measured.mean() < 1

@@ -11,8 +11,9 @@ import pytest
 
 from research.tests.cli.support import run
 from research.train.map_grids import made_of_room, training_map
-from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import load_nesf
+from semantic_mapper.fields.weights import find_checkpoint
 from semantic_mapper.labels import ROOMS
 from tests.mapping.test_refine import UP, make_map
 from tests.nodes.support import COMMAND as PRODUCT

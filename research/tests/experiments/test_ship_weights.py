@@ -10,7 +10,8 @@ import torch
 from research.suites.entries import load_entries
 from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship, ship_on_base
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from tests.small import tiny_field
 
 COMMIT = "a" * 40

@@ -13,8 +13,8 @@ from research.suites.protocols import run_room
 from research.suites.rooms import as_given
 from research.suites.scoring import from_rows, interior_truth
 from research.tests.suites.tiny import tiny_contestant, tiny_room, tiny_suite
-from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import PosedFrame, SourceViews
 from tests.small import tiny_field

@@ -5,7 +5,8 @@ import pytest
 
 from research.suites.entries import load_entries
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, Checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.weights import COMPUTED_DEPTH
 from tests.small import tiny_field
 
 

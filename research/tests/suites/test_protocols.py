@@ -22,8 +22,8 @@ from research.suites.scene_box import scene_config
 from research.suites.scoring import from_rows
 from research.tests.suites.tiny import tiny_contestant, tiny_room, tiny_suite
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.volume import around_computed
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews

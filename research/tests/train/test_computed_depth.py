@@ -16,8 +16,8 @@ from research.train.train import train
 from research.train.view_draws import cropped_view
 from semantic_mapper.config import SamplingConfig, convert_config
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.sampling import COMPUTED_GUIDED
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.volume import COMPUTED_GUIDED
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.views import mirrored_view, stack_sources
 from tests.small import SMALL_ENCODER, SMALL_MODEL

@@ -13,8 +13,9 @@ from research.train.rooms import RoomPoolConfig
 from research.train.ship_weights import BEGIN, CARD, END, chain, check_chain, metadata_block
 from research.train.train_config import TrainStepConfig
 from research.train.validation import Scores, ValidationConfig, validate, validation_rooms
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField, build_field
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.labels import ROOMS
 
 ALONE = Ranks()

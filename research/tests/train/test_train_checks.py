@@ -10,10 +10,10 @@ from research.tests.train.small_run import small_run
 from research.train.train import train
 from research.train.train_checks import check_field
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.learned import build_field
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import SourceViews
 from tests.small import SMALL_MODEL, tiny_field

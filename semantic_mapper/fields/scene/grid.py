@@ -19,9 +19,9 @@ from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, GridFieldConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.march import BIAS, CELL, KEPT, GridArrays, RayArrays, array_of, gather, march
+from semantic_mapper.fields.views import EncodedViews, check_views, encoded_views
 from semantic_mapper.fields.volume import composite_depth, field_render
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews

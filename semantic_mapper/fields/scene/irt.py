@@ -17,8 +17,9 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import GridConfig, IRTConfig, SamplingConfig
-from semantic_mapper.fields.base import MIN_DEPTH_M, EncodedViews, check_views, encoded_views, own_view
+from semantic_mapper.fields.numbers import MIN_DEPTH_M
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
+from semantic_mapper.fields.views import EncodedViews, check_views, encoded_views, own_view
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import RayBatch, SourceViews
 

@@ -18,13 +18,12 @@ from torch import nn
 
 from semantic_mapper.config import BoxConfig, PanopticConfig, SamplingConfig
 from semantic_mapper.errors import LabelError
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.scene.boxes import Intervals, MovingBoxes, PrimitiveSet, trimmed
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
 from semantic_mapper.fields.scene.irt import at_measured
 from semantic_mapper.fields.scene.march import KEPT
 from semantic_mapper.fields.scene.primitives import Primitive, resized
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.types import FieldRender, Int64, RayBatch
 

@@ -1,0 +1,238 @@
+"""S-Ray's networks over images, run by OpenVINO: the same answer as ``SRay.encode``, without torch.
+
+Each view is encoded by itself, so a network is built once for a size of image, from the tensors of a weights file.
+"""
+
+from __future__ import annotations
+
+# OpenVINO leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import openvino as ov
+from numpy.typing import NDArray
+from openvino import opset13 as ops
+
+from semantic_mapper.config import SRayConfig
+from semantic_mapper.fields.numbers import (
+    BACKBONE_DEVIATION,
+    BACKBONE_MEAN,
+    BACKBONE_STAGES,
+    COLOUR_DEVIATION,
+    COLOUR_MEAN,
+    COMMON_FOCAL,
+    FAR_M,
+    GEOMETRY_CHANNELS,
+    MEASURED_SCALE,
+    MEASURED_SHIFT,
+    NEAR_M,
+    NORM_EPSILON,
+    PREDICTED_SCALE,
+    SURFACE_CHANNELS,
+    TORCH_NORM_EPSILON,
+)
+from semantic_mapper.kernels.binding import thread_count
+from semantic_mapper.types import Float32, UInt8
+
+Array = NDArray[Any]
+Node = ov.Node
+
+
+class EncodedImage(NamedTuple):
+    """What the networks say of one image (H, W)."""
+
+    feature: Float32  # (h, w, C) the F_j of S-Ray Eq. 5; h = H / 2 and w = W / 2, rounded up
+    geometry: Float32  # (h, w, 5) mixture of logistics along each view ray
+    picture: Float32  # (D,) mean of the coarsest features of the frozen backbone; (0,) without a backbone
+
+
+class ImageNetwork:
+    """The networks of one S-Ray, compiled for images of one size (H, W).
+
+    ``with_depth``: the one for views with measured depth, else the one that sees colours alone. The result depends on
+    the number of threads and the kind of processor in its last digits."""
+
+    def __init__(
+        self, tensors: Mapping[str, Array], config: SRayConfig, size: tuple[int, int], *, with_depth: bool
+    ) -> None:
+        self.size = (size[0] + 1) // 2, (size[1] + 1) // 2
+        self._with_depth = with_depth
+        model = _Builder(tensors, config).build(size, self.size, with_depth=with_depth)
+        threads = {"INFERENCE_NUM_THREADS": thread_count(), "ENABLE_CPU_PINNING": False}
+        exact = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+        self._request = ov.Core().compile_model(model, "CPU", threads | exact).create_infer_request()
+
+    def encode(self, rgb: UInt8, maps: Float32 | None, depth_m: Float32, spread: Float32, focal: float) -> EncodedImage:
+        """Encode an image (H, W, 3).
+
+        ``maps`` (5, H, W) as of ``surface_maps``; None for the network that sees none. ``depth_m`` (h, w) as it was
+        measured, 0 = none, and its ``spread`` as a fraction of it, 0 = measured; ``focal`` in image widths."""
+        inputs = [rgb[None], depth_m[None, None], spread[None, None], np.array([focal], np.float32)]
+        self._request.infer([*inputs, *([] if maps is None else [maps[None]])], share_inputs=True)
+        return EncodedImage(*(self._request.get_output_tensor(i).data[0].copy() for i in range(3)))
+
+
+def check_networks(tensors: Mapping[str, Array], config: SRayConfig) -> None:
+    """Raises KeyError: a tensor is missing; its name. RuntimeError: tensors do not fit together, or the config."""
+    for with_depth in (False, True)[: 1 + config.encoder.depth]:
+        _Builder(tensors, config).build((64, 64), (32, 32), with_depth=with_depth)
+
+
+class _Builder:
+    """Builds the graph; its names are those of the modules of ``encoder`` and ``sray``, whose tensors it takes."""
+
+    def __init__(self, tensors: Mapping[str, Array], config: SRayConfig) -> None:
+        self._tensors = tensors
+        self._config = config
+
+    def build(self, size: tuple[int, int], low: tuple[int, int], *, with_depth: bool) -> ov.Model:
+        """The graph from the inputs of ``ImageNetwork.encode`` to its outputs."""
+        (height, width), (h, w) = size, low
+        rgb = ops.parameter([1, height, width, 3], np.uint8, "rgb")
+        depth, spread = (ops.parameter([1, 1, h, w], np.float32, name) for name in ("depth", "spread"))
+        focal = ops.parameter([1], np.float32, "focal")
+        inputs = [rgb, depth, spread, focal]
+        colours = ops.transpose(ops.convert(rgb, np.float32), [0, 3, 1, 2])
+        seen = (colours - _f(255 * COLOUR_MEAN)) * _f(1 / (255 * COLOUR_DEVIATION))
+        if with_depth:
+            inputs.append(maps := ops.parameter([1, SURFACE_CHANNELS, height, width], np.float32, "maps"))
+            seen = ops.concat([seen, maps], 1)
+        photo = (colours * _f(1 / 255) - _f(BACKBONE_MEAN)) * _f(1 / BACKBONE_DEVIATION)
+        net = "encoder.depth_net" if with_depth else "encoder.colour_net"
+        feature, picture = self._unet(net, seen, photo, size)
+        geometry = self._geometry(feature, depth, spread, focal)
+        feature, geometry = (ops.transpose(each, [0, 2, 3, 1]) for each in (feature, geometry))
+        model: Any = ov.Model  # whose type is not that of what it makes
+        return model([feature, geometry, picture], inputs, "sray")
+
+    def _unet(self, name: str, seen: Node, photo: Node, size: tuple[int, int]) -> tuple[Node, Node]:
+        """Features (1, C, h, w), and the mean of the backbone's coarsest (1, D)."""
+        config = self._config.encoder
+        blocks, pretrained = config.blocks, config.backbone != "residual"
+        count = len(config.channels)
+        skips: list[Node] = []
+        picture: Node = ops.constant(np.zeros((1, 0), np.float32))
+        if pretrained:
+            maps = self._backbone(f"{name}.backbone", photo, size, count)
+            skips = [self._conv(f"{name}.laterals.{i}", each) for i, each in enumerate(maps)]
+            picture = ops.reduce_mean(maps[-1], [2, 3])
+        x = ops.relu(self._conv(f"{name}.stem", seen, stride=2, pad=2))
+        for i in range(count - pretrained):
+            x = self._residual(f"{name}.stages.{i}.0", x, 2 if i > 0 else 1)
+            for k in range(1, blocks[i]):
+                x = self._residual(f"{name}.stages.{i}.{k}", x, 1)
+            if pretrained:
+                skips[i] = skips[i] + x
+            else:
+                skips.append(x)
+        refine = blocks if pretrained else [int(i > 0) for i in range(count)]
+        x = skips.pop()
+        for up, i in enumerate(reversed(range(count - 1))):
+            x = self._up(f"{name}.ups.{up}", x, skips.pop(), refine[i])
+        return self._conv(f"{name}.head", x, pad=1), picture
+
+    def _backbone(self, name: str, photo: Node, size: tuple[int, int], stages: int) -> list[Node]:
+        """Feature maps at strides 2, 4, ..., the finest first; see ``EfficientNetLite0``."""
+        x, size = self._strided(f"{name}.stem", photo, size)
+        x = ops.clamp(x, 0.0, 6.0)
+        maps: list[Node] = []
+        for i, stage in enumerate(BACKBONE_STAGES[:stages]):
+            for k, (c_in, c_out, kernel, stride, expansion) in enumerate(stage):
+                block, y = f"{name}.stages.{i}.{k}", x
+                if expansion > 1:
+                    y = ops.clamp(self._normed(f"{block}.expand", y), 0.0, 6.0)
+                if stride == 2:
+                    y, size = self._strided(f"{block}.depthwise", y, size, groups=c_in * expansion)
+                else:
+                    y = self._normed(f"{block}.depthwise", y, pad=kernel // 2, groups=c_in * expansion)
+                y = self._normed(f"{block}.project", ops.clamp(y, 0.0, 6.0))
+                x = x + y if stride == 1 and c_in == c_out else y
+            maps.append(x)
+        return maps
+
+    def _geometry(self, feature: Node, depth: Node, spread: Node, focal: Node) -> Node:
+        """The mixture (1, 5, h, w); see ``GeometryInit``."""
+        measured = ops.greater(depth, _f(0))
+        near = ops.maximum(depth, _f(NEAR_M))
+        inverse = ops.select(measured, _f(1) / near, _f(0))
+        x = ops.concat([feature, inverse, ops.convert(measured, np.float32)], 1)
+        x = ops.relu(self._conv("geometry_init.net.0", x, pad=1))
+        raw = self._conv("geometry_init.net.2", x, pad=1)
+        shift, widen, behind, widen_behind, fraction, guess = (
+            ops.slice(raw, [i], [i + 1], [1], [1]) for i in range(GEOMETRY_CHANNELS + 1)
+        )
+        predicted = _f(1) / (_f(1 / FAR_M) + _f(1 / NEAR_M - 1 / FAR_M) * ops.sigmoid(guess - _f(2.0)))
+        if self._config.tokens == "surface":
+            predicted = predicted * (focal * _f(1 / COMMON_FOCAL))
+        mu_1 = ops.select(measured, depth * (_f(1) + _f(MEASURED_SHIFT) * ops.tanh(shift)), predicted)
+        start = ops.maximum(ops.select(measured, _f(MEASURED_SCALE), _f(PREDICTED_SCALE)), spread)
+        s_1 = mu_1 * start * ops.exp(ops.clamp(widen, -3.0, 3.0))
+        mu_2 = mu_1 * (_f(1.02) + ops.softplus(behind))
+        s_2 = mu_2 * _f(PREDICTED_SCALE) * ops.exp(ops.clamp(widen_behind, -3.0, 3.0))
+        return ops.concat([mu_1, s_1, mu_2, s_2, ops.sigmoid(fraction + _f(3.0))], 1)
+
+    def _residual(self, name: str, x: Node, stride: int) -> Node:
+        y = ops.relu(self._normed(f"{name}.conv1", x, stride=stride, pad=1, norm=f"{name}.norm1"))
+        y = self._normed(f"{name}.conv2", y, pad=1, norm=f"{name}.norm2")
+        if stride > 1:
+            x = ops.avg_pool(x, [stride] * 2, [0, 0], [0, 0], [stride] * 2, True, "ceil")
+        if f"{name}.shortcut.weight" in self._tensors:
+            x = self._conv(f"{name}.shortcut", x)
+        return ops.relu(y + x)
+
+    def _up(self, name: str, x: Node, skip: Node, refine: int) -> Node:
+        height, width = list(skip.get_output_shape(0))[2:]
+        x = self._conv(f"{name}.reduce", x)
+        x = ops.interpolate(
+            x, np.array([2.0, 2.0], np.float32), "nearest", "scales", axes=np.array([2, 3]),
+            coordinate_transformation_mode="asymmetric", nearest_mode="floor",
+        )  # fmt: skip
+        x = ops.slice(x, [0, 0], [height, width], [1, 1], [2, 3]) + skip
+        for i in range(refine):
+            x = self._residual(f"{name}.refine" if refine == 1 else f"{name}.refine.{i}", x, 1)
+        return x
+
+    def _strided(self, name: str, x: Node, size: tuple[int, int], groups: int = 1) -> tuple[Node, tuple[int, int]]:
+        """Of stride 2, padded as TensorFlow's "SAME" pads; see ``StridedConvolution``."""
+        pads = [self._tensors[f"{name}.weight"].shape[-1] - 2 + side % 2 for side in size]
+        begin, end = [p // 2 for p in pads], [p - p // 2 for p in pads]
+        x = self._normed(name, x, stride=2, pad=(begin, end), groups=groups)
+        return x, ((size[0] + 1) // 2, (size[1] + 1) // 2)
+
+    def _normed(self, name: str, x: Node, *, norm: str = "", **options: Any) -> Node:
+        """A convolution with the batch norm after it folded in."""
+        epsilon = TORCH_NORM_EPSILON if norm else NORM_EPSILON  # of residual blocks; of the backbone
+        norm = norm or f"{name}_norm"
+        gamma, beta, mean, var = (
+            self._tensors[f"{norm}.{n}"].astype(np.float64) for n in ("weight", "bias", "running_mean", "running_var")
+        )
+        scale = gamma / np.sqrt(var + epsilon)
+        weight = self._tensors[f"{name}.weight"] * scale[:, None, None, None]
+        return self._convolve(x, weight, beta - mean * scale, **options)
+
+    def _conv(self, name: str, x: Node, **options: Any) -> Node:
+        return self._convolve(x, self._tensors[f"{name}.weight"], self._tensors[f"{name}.bias"], **options)
+
+    def _convolve(
+        self,
+        x: Node,
+        weight: Array,
+        bias: Array,
+        *,
+        stride: int = 1,
+        pad: int | tuple[list[int], list[int]] = 0,
+        groups: int = 1,
+    ) -> Node:
+        begin, end = ([pad] * 2, [pad] * 2) if isinstance(pad, int) else pad
+        shape = [stride] * 2, begin, end, [1, 1]
+        if groups == 1:
+            y = ops.convolution(x, _f(weight), *shape)
+        else:
+            y = ops.group_convolution(x, _f(weight.reshape(groups, -1, *weight.shape[1:])), *shape)
+        return y + _f(bias.reshape(1, -1, 1, 1))
+
+
+def _f(value: float | Array) -> Node:
+    return ops.constant(np.asarray(value, np.float32))
