@@ -58,7 +58,7 @@ class EncoderConfig(Config, frozen=True):
     # "efficientnet-lite0": a network that may start from ImageNet weights, between a small stem and a decoder;
     # ``channels`` and ``blocks`` are the decoder's then
     backbone: Literal["residual", "efficientnet-lite0"] = "residual"
-    depth: bool = False  # whether it sees measured depth (as ``fields.encoder.surface_maps`` puts it) next to colours
+    depth: bool = False  # whether it sees measured depth (as ``fields.surface_maps`` puts it) next to colours
     # Whether it has learned from depth that was computed from pictures, too (``pool.computed_depth`` of a training).
     # An encoder that has not is shown none: it would be misled.
     computed_depth: bool = False

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,13 +105,6 @@ class StreamField(Protocol[EncodedT]):
     def source_logits(self, sources: EncodedT) -> Float32 | None:
         """Logits (h, w, L) of an encoded view by itself; None where the field has no opinion of single images."""
         ...
-
-
-@runtime_checkable
-class Sampled(Protocol):
-    """A field whose ``render`` draws its samples as a setting says, which may change between two renders."""
-
-    sampling: SamplingConfig
 
 
 def check_classes(field: StreamField[Any], label_set: LabelSet) -> None:

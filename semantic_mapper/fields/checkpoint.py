@@ -17,7 +17,8 @@ from torch import nn
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
-from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamedViews, StreamingSRay
+from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.fields.weights import MESSAGE, Tensors, WeightsFile, find_checkpoint, load_weights, weights_bytes
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
@@ -68,6 +69,19 @@ def streaming(model: LearnedField, sampling: SamplingConfig | None = None) -> St
     """The compiled renderer of an S-Ray; weights on the CPU are shared."""
     assert isinstance(model.config, SRayConfig)
     return StreamingSRay(model.config, model.label_set, tensors_of(model), sampling or model.sampling)
+
+
+def streamed(views: EncodedViews) -> StreamedViews:
+    """What an S-Ray has encoded, as the compiled renderer takes it."""
+
+    def array(tensor: torch.Tensor) -> NDArray[Any]:
+        return tensor.detach().cpu().contiguous().numpy()
+
+    feature, rgb, geometry = (array(t.permute(0, 2, 3, 1)) for t in (views.feature, views.rgb, views.geometry))
+    lens = torch.cat((views.K.diagonal(dim1=1, dim2=2)[:, :2], views.K[:, :2, 2]), dim=1)
+    labels = views.channel if (views.channel >= 0).any() else views.channel[:, :0, :0]
+    poses = array(views.T_camera_world[:, :3])
+    return StreamedViews(feature, rgb, geometry, np.log(geometry[..., 1]), array(lens), poses, array(labels))
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:

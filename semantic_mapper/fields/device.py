@@ -101,7 +101,7 @@ GPU_PAIRS = GPU_CHUNK * 16**2  # pairs of samples that attend to each other are 
 
 
 class DeviceField:
-    """Inference-only field of torch on a device. Satisfies ``StreamField`` and ``Sampled``.
+    """Inference-only field of torch on a device. Satisfies ``StreamField``.
 
     Weights, features of keyframes and rays stay on the device. Sums on a GPU come in no fixed order: its renders repeat
     but for the last digits. The model is copied on a GPU; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
@@ -122,15 +122,6 @@ class DeviceField:
     def label_set(self) -> LabelSet:
         """Classes of the rendered logits, in channel order."""
         return self.model.label_set
-
-    @property
-    def sampling(self) -> SamplingConfig:
-        """Where rays are sampled; may be exchanged between two renders."""
-        return self.model.sampling
-
-    @sampling.setter
-    def sampling(self, sampling: SamplingConfig) -> None:
-        self.model.sampling = sampling
 
     @property
     def rays_per_chunk(self) -> int:
@@ -175,6 +166,7 @@ class DeviceField:
         origin, direction, prior, measured = map(
             torch.from_numpy, (rays.origin, rays.direction, rays.prior_depth_m, rays.measured)
         )
+        self.model.sampling = self.sampling
         batch = RayBatch(origin, direction, near, far, prior, measured, rays.stamp_ns)
         with torch.inference_mode():
             found = self.model.render(to_device(batch, self.device), sources)

@@ -76,7 +76,7 @@ def find_domain_check(weights: WeightsFile, field: StreamField[Any]) -> DomainCh
 def backbone_digests(weights: WeightsFile) -> set[str]:
     """What tells the weights of its backbones from others."""
     found: dict[str, Any] = {}
-    for name, tensor in weights.tensors.items():
+    for name, tensor in sorted(weights.tensors.items()):
         network, backbone, _ = name.partition(".backbone.")
         if backbone:
             found.setdefault(network, hashlib.sha256()).update(np.ascontiguousarray(tensor).tobytes())

@@ -45,6 +45,7 @@ class EncodedImage(NamedTuple):
 
     feature: Float32  # (h, w, C) the F_j of S-Ray Eq. 5; h = H / 2 and w = W / 2, rounded up
     geometry: Float32  # (h, w, 5) mixture of logistics along each view ray
+    rgb: Float32  # (h, w, 3) in [0, 1]
     picture: Float32  # (D,) mean of the coarsest features of the frozen backbone; (0,) without a backbone
 
 
@@ -71,7 +72,7 @@ class ImageNetwork:
         measured, 0 = none, and its ``spread`` as a fraction of it, 0 = measured; ``focal`` in image widths."""
         inputs = [rgb[None], depth_m[None, None], spread[None, None], np.array([focal], np.float32)]
         self._request.infer([*inputs, *([] if maps is None else [maps[None]])], share_inputs=True)
-        return EncodedImage(*(self._request.get_output_tensor(i).data[0].copy() for i in range(3)))
+        return EncodedImage(*(output.data[0].copy() for output in self._request.output_tensors))
 
 
 def check_networks(tensors: Mapping[str, Array], config: SRayConfig) -> None:
@@ -103,9 +104,10 @@ class _Builder:
         net = "encoder.depth_net" if with_depth else "encoder.colour_net"
         feature, picture = self._unet(net, seen, photo, size)
         geometry = self._geometry(feature, depth, spread, focal)
-        feature, geometry = (ops.transpose(each, [0, 2, 3, 1]) for each in (feature, geometry))
+        small = ops.adaptive_avg_pool(colours * _f(1 / 255), np.array([h, w]))
+        feature, geometry, small = (ops.transpose(each, [0, 2, 3, 1]) for each in (feature, geometry, small))
         model: Any = ov.Model  # whose type is not that of what it makes
-        return model([feature, geometry, picture], inputs, "sray")
+        return model([feature, geometry, small, picture], inputs, "sray")
 
     def _unet(self, name: str, seen: Node, photo: Node, size: tuple[int, int]) -> tuple[Node, Node]:
         """Features (1, C, h, w), and the mean of the backbone's coarsest (1, D)."""

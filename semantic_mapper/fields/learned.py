@@ -18,7 +18,7 @@ from semantic_mapper.config import (
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.kinds import field_config, field_kinds
 from semantic_mapper.fields.views import EncodedViews
-from semantic_mapper.fields.volume import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.volume import sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 

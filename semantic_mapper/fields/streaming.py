@@ -64,7 +64,7 @@ class StreamedViews(NamedTuple):
 
 
 class StreamingSRay:
-    """Inference-only S-Ray on the CPU. Satisfies ``StreamField`` and ``Sampled``.
+    """Inference-only S-Ray on the CPU. Satisfies ``StreamField``.
 
     ``tensors`` are those of a weights file of this ``config``. ``sampling``: guided sampling round the depth prior.
     ``like``: one whose encoder has the same weights (``weights.encode_alike``), whose networks are shared.
@@ -103,7 +103,9 @@ class StreamingSRay:
     def encode(self, view: WorkingView) -> StreamedViews:
         """As ``SRay.encode``. Raises ShapeError: arrays that do not fit together."""
         height, width = expect_shape(view.rgb, "H W 3", "source rgb").values()
-        expect_shape(view.depth_m, f"{height} {width}", "source depth_m")
+        for name in ("depth_m", "channel", "depth_sigma_m"):
+            if (image := getattr(view, name)) is not None:
+                expect_shape(image, f"{height} {width}", f"source {name}")
         depth, spread = view.depth_m, np.zeros_like(view.depth_m)
         if view.depth_sigma_m is not None:
             # What was computed and is not sure becomes a hole; all of it, for weights that have not learned from such.
@@ -118,10 +120,10 @@ class StreamingSRay:
         rows, columns = (((np.arange(n) + 0.5) * (full / n)).astype(int) for n, full in ((h, height), (w, width)))
         small = np.ix_(rows, columns)
         maps = surface_maps(depth, K) if with_depth else None
-        feature, geometry, picture = network.encode(view.rgb, maps, depth[small], spread[small], float(K[0, 0]) / width)
+        focal = float(K[0, 0]) / width
+        feature, geometry, rgb, picture = network.encode(view.rgb, maps, depth[small], spread[small], focal)
         scale = np.array((w / width, h / height), np.float32)
         lens = np.concatenate((K.diagonal()[:2] * scale, (K[:2, 2] + 0.5) * scale - 0.5))
-        rgb = np.asarray(cv2.resize(view.rgb / np.float32(255), (w, h), interpolation=cv2.INTER_AREA), np.float32)
         none = np.empty((0, 0), np.int16)
         channel = none if view.channel is None else view.channel.astype(np.int16)
         pose = _inverse(view.T_world_camera)
@@ -137,10 +139,9 @@ class StreamingSRay:
         sizes = {v.size for v in views}
         if len(sizes) != 1:
             raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
-        labelled = next((v.channel.shape[1:] for v in views if v.channel.size), (0, 0))
-        channel = [v.channel if v.channel.size else np.full((len(v.K), *labelled), -1, np.int16) for v in views]
-        joined = StreamedViews(*map(np.concatenate, zip(*(v[:-1] for v in views), strict=True)), channel=channel[0])
-        return joined._replace(channel=np.concatenate(channel))
+        rows, columns = max(v.channel.shape[1:] for v in views)
+        channel = [labels for v in views for labels in _labels(v, rows, columns)]
+        return StreamedViews(*map(np.concatenate, zip(*(v[:-1] for v in views), strict=True)), np.stack(channel))
 
     def source_logits(self, sources: StreamedViews) -> Float32:
         """Logits (h, w, L) of an encoded image by itself."""
@@ -261,6 +262,14 @@ def _check_views(sources: StreamedViews, channels: int) -> None:
     expect_shape(sources.K, f"{count} 4", "source K")
     expect_shape(sources.T_camera_world, f"{count} 3 4", "source T_camera_world")
     expect_shape(sources.channel, f"{count} H W", "source channel")
+
+
+def _labels(views: StreamedViews, rows: int, columns: int) -> list[NDArray[np.int16]]:
+    """Known labels of each view at one size: images of odd and of even sizes have features of one size."""
+    if not views.channel.size:
+        return [np.full((rows, columns), -1, np.int16)] * len(views.K)
+    size = columns, rows
+    return [np.asarray(cv2.resize(c, size, interpolation=cv2.INTER_NEAREST), np.int16) for c in views.channel]
 
 
 def _inverse(T_world_camera: Float64) -> Float32:

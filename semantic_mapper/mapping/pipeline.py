@@ -17,6 +17,7 @@ from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import Encoded, StreamField, WorkingView, check_classes
 from semantic_mapper.fields.domain_check import DomainCheck
+from semantic_mapper.fields.render import View
 from semantic_mapper.geometry import check_pose, scale_intrinsics
 from semantic_mapper.imaging import (
     FrameViews,
@@ -254,7 +255,8 @@ class MappingPipeline:
             return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(views, intrinsics)
-        return renderer.render(
+        view = View(
+            renderer.field,
             self.field.stack(sources),
             intrinsics,
             frame.T_world_camera,

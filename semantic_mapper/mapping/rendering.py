@@ -6,6 +6,7 @@ of probabilities a pixel."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -13,8 +14,7 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import Sampled, StreamField
+from semantic_mapper.fields.base import StreamField
 from semantic_mapper.fields.render import View, render_sparse_view, render_view, softmax
 from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.geometry import expect_shape
@@ -57,19 +57,8 @@ class ViewRenderer:
         if self._rate_controller is not None:
             self._rate_controller.note(render_ms, other_ms, *self._last)
 
-    def render(
-        self,
-        sources: Any,
-        intrinsics: CameraIntrinsics,
-        T_world_camera: Float64,
-        prior_m: Float32,
-        rgb: UInt8,
-        *,
-        measured: Bool | None = None,
-        computed: bool = False,
-        stamp_ns: int | None = None,
-    ) -> RenderedView:
-        """Render one view, (h, w), from sources at a pose (4, 4).
+    def render(self, view: View, rgb: UInt8, *, computed: bool = False) -> RenderedView:
+        """Render a view (h, w) of the field, with samples as the settings, or the rate to hold, say.
 
         ``rgb`` is (h, w, 3) uint8; ``computed``: the depth prior was computed from pictures and may be farther off."""
         prior_m = view.prior_depth_m

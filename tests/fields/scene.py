@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from semantic_mapper.fields.base import Rays
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, RayBatch, SourceViews
@@ -55,3 +56,12 @@ def wall_rays(T_world_camera: np.ndarray, step: int = 1, prior: float = WALL_M) 
         far_m=8.0,
         prior_depth_m=torch.full((len(pixels),), prior),
     )
+
+
+def streamed_rays(rays: RayBatch) -> Rays:
+    """Rays of one range, as the compiled renderer takes them."""
+    origin, direction, prior = (
+        np.ascontiguousarray(t.numpy()) for t in (rays.origin, rays.direction, rays.prior_depth_m)
+    )
+    measured = prior > 0 if rays.measured is None else rays.measured.numpy()
+    return Rays(origin, direction, float(rays.near_m[0]), float(rays.far_m[0]), prior, measured)

@@ -31,12 +31,15 @@ def test_meadows_are_unlike_rooms_and_it_is_said_live_and_in_the_summary(tmp_pat
         assert len(said) == bool(unlike) and all("5 of 5 pictures" in s and "finetune" in s for s in said)
         assert any("5 of 5" in warning for warning in session.warnings) == bool(unlike)
         check = session.pipeline.domain_check
-        session.pipeline.exchange_field(streaming(session.mapper.checkpoint.model), ())
+        session.pipeline.exchange_field(streaming(session.mapper.model), ())
         assert check is not None and session.pipeline.domain_check is None, "weights fitted to this place know it"
 
 
 def test_weights_that_learned_something_else_have_no_check():
-    shipped = Mapper.load().checkpoint
-    assert find_domain_check(replace(shipped, recipe={"kind": "finetune"}), shipped.model) is None
-    field = tiny_field()
-    assert find_domain_check(Checkpoint(field, recipe=shipped.recipe), field) is None, "it has another backbone"
+    mapper = Mapper.load()
+    shipped, field = mapper.weights, mapper.pipeline.field
+    assert find_domain_check(shipped, field) is not None
+    assert find_domain_check(replace(shipped, recipe={"kind": "finetune"}), field) is None
+    tiny = tiny_field()
+    other = Checkpoint(tiny, recipe=shipped.recipe).weights
+    assert find_domain_check(other, streaming(tiny)) is None, "it has another backbone"

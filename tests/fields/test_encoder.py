@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import msgspec
+import numpy as np
 import pytest
 import torch
 
@@ -20,7 +21,7 @@ from tests.small import SMALL_ENCODER
 
 SMALL = EncoderConfig(backbone="efficientnet-lite0", channels=(8, 8, 12), blocks=(1, 0, 0), depth=True)
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
-K = torch.from_numpy(camera_matrix(CAMERA)).float()[None]
+K = camera_matrix(CAMERA).astype(np.float32)
 HEIGHT_M = 1.4
 
 
@@ -111,20 +112,20 @@ def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
 
 
 def floor_depth(pitch: float) -> torch.Tensor:
-    """Depth (1, H, W) of a level floor below a camera that is inclined downwards; 0 where the ray does not fall."""
+    """Depth (H, W) of a level floor below a camera that is inclined downwards; 0 where the ray does not fall."""
     v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     ray = torch.stack(((u - 79.5) / 110, (v - 59.5) / 110, torch.ones_like(u)))
     falls = torch.einsum("ihw,i->hw", ray, torch.tensor([0.0, math.cos(pitch), math.sin(pitch)]))
-    return torch.where(falls > 0.05, HEIGHT_M / falls.clamp_min(0.05), 0)[None]
+    return torch.where(falls > 0.05, HEIGHT_M / falls.clamp_min(0.05), 0)
 
 
 @pytest.mark.parametrize("pitch_deg", [0, 15, 40])
 def test_a_level_floor_is_level_at_height_nought_and_faces_up(pitch_deg: int):
     depth = floor_depth(math.radians(pitch_deg))
-    inverse, measured, height, level, facing = surface_maps(depth, K)[0]
-    seen = depth[0] > 0
+    inverse, measured, height, level, facing = torch.from_numpy(surface_maps(depth.numpy(), K))
+    seen = depth > 0
     assert torch.equal(measured, seen.float())
-    torch.testing.assert_close(inverse[seen], 1 / depth[0][seen])
+    torch.testing.assert_close(inverse[seen], 1 / depth[seen])
     assert float(height[seen].abs().max()) < 0.02
     inner = level != 0  # beside holes and at the border there is no normal
     assert inner.float().mean() > 0.3
@@ -133,8 +134,8 @@ def test_a_level_floor_is_level_at_height_nought_and_faces_up(pitch_deg: int):
 
 
 def test_without_depth_there_is_nothing_and_holes_stay_holes():
-    assert not surface_maps(torch.zeros(2, 24, 32), K.expand(2, 3, 3)).any()
-    depth = floor_depth(0.5)
-    depth[0, 70:80, 60:90] = 0
-    maps = surface_maps(torch.cat((depth, torch.zeros_like(depth))), K.expand(2, 3, 3))
-    assert torch.isfinite(maps).all() and not maps[0, :, 70:80, 60:90].any() and not maps[1].any()
+    assert not surface_maps(np.zeros((24, 32), np.float32), K).any()
+    depth = floor_depth(0.5).numpy()
+    depth[70:80, 60:90] = 0
+    maps = surface_maps(depth, K)
+    assert np.isfinite(maps).all() and not maps[:, 70:80, 60:90].any() and maps.any()

@@ -2,23 +2,21 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
+from semantic_mapper.fields.base import Rays, Rendered
 from semantic_mapper.fields.render import (
     View,
     render_sparse_view,
     render_view,
 )
-from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.types import CameraIntrinsics, FieldRender, RayBatch
+from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(30.0, 30.0, 19.5, 14.5, 40, 30)
 LABELS = make_label_set("two", ("left", "right"), ids=(1, 2), ignore_id=0)
 SAMPLING = SamplingConfig()
-NOTHING = EncodedViews(*(torch.zeros(1) for _ in range(6)))
 
 
 @dataclasses.dataclass
@@ -31,25 +29,24 @@ class Halves:
     rays: int = 0
     label_set = LABELS
 
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+    def render(self, rays: Rays, sources: None) -> Rendered:
         u = rays.direction[:, 0] / rays.direction[:, 2] * CAMERA.fx + CAMERA.cx
         v = rays.direction[:, 1] / rays.direction[:, 2] * CAMERA.fy + CAMERA.cy
         self.rays += len(u)
-        logits = self.sure * torch.stack(((u < self.border).float(), (u >= self.border).float()), 1)
-        known = v > self.unknown_above - 0.5
-        ones = torch.ones_like(u)
-        return FieldRender(logits, rays.prior_depth_m, ones, torch.zeros(len(u), 3), ones, known)
+        logits = self.sure * np.stack((u < self.border, u >= self.border), 1).astype(np.float32)
+        known, ones = v > self.unknown_above - 0.5, np.ones_like(u)
+        return Rendered(logits, rays.prior_depth_m, ones, np.zeros((len(u), 3), np.float32), known)
 
 
 PRIOR, GREY = np.full((30, 40), 2.0, np.float32), np.full((30, 40, 3), 90, np.uint8)
 
 
 def sparse(field: Halves, prior: np.ndarray = PRIOR, fraction: float = 0.99, rgb: np.ndarray = GREY):
-    return render_sparse_view(View(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128), rgb, fraction)  # type: ignore[arg-type]
+    return render_sparse_view(View(field, None, CAMERA, np.eye(4), prior, SAMPLING, 128), rgb, fraction)  # type: ignore[arg-type]
 
 
 def dense(field: Halves):
-    return render_view(View(field, NOTHING, CAMERA, np.eye(4), PRIOR, SAMPLING, 128))  # type: ignore[arg-type]
+    return render_view(View(field, None, CAMERA, np.eye(4), PRIOR, SAMPLING, 128))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("border", [15.5, 16.5, 17.5, 18.5])

@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from semantic_mapper.errors import ShapeError
+from semantic_mapper.fields.base import Rendered
+from semantic_mapper.fields.checkpoint import streamed, streaming
 from semantic_mapper.fields.sray import SRay, contextual_space, hit_and_visibility, surface_space
 from semantic_mapper.fields.views import EncodedViews, gather, reproject, stack_views
 from semantic_mapper.fields.volume import compositing_weights, sample_inverse_depth
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
-from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
+from tests.fields.scene import WALL_M, pose_at, streamed_rays, wall_colour, wall_rays, wall_sources
 from tests.fields.tiny_fields import POSES, assert_gradients_are_right, tiny
 
 
@@ -154,21 +156,23 @@ def ending_at(encoded: EncodedViews, z: float) -> EncodedViews:
 
 
 def rendered(
-    field: SRay, rays: RayBatch, z: torch.Tensor, encoded: EncodedViews, streaming: bool
-) -> tuple[FieldRender, torch.Tensor]:
+    field: SRay, rays: RayBatch, z: torch.Tensor, encoded: EncodedViews, compiled: bool
+) -> tuple[FieldRender | Rendered, torch.Tensor]:
     """By the field or by its compiled renderer; and what the views say by themselves."""
     with torch.no_grad():
-        slow = field.render_samples(rays, z, encoded)[0]
-        render = streaming(field).render_samples(rays, z, encoded) if streaming else slow
-        return render, field.source_logits(encoded)
+        said = field.source_logits(encoded)
+        if not compiled:
+            return field.render_samples(rays, z, encoded)[0], said
+    found = streaming(field).render_samples(streamed_rays(rays), z.numpy(), streamed(encoded))
+    return Rendered(*map(torch.from_numpy, found)), said
 
 
 def on_wall(rays: RayBatch) -> torch.Tensor:
     return torch.tensor([0.97, 0.99, 1.01, 1.03])[None].expand(len(rays.origin), 4) * WALL_M
 
 
-@pytest.mark.parametrize("streaming", [False, True])
-def test_a_ray_that_meets_nothing_takes_what_the_views_say_of_its_direction(streaming: bool):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_ray_that_meets_nothing_takes_what_the_views_say_of_its_direction(compiled: bool):
     """The sky: no surface within reach, but every view that looks that way has an opinion of it."""
     field = small_field()
     views = wall_sources(POSES)
@@ -176,7 +180,7 @@ def test_a_ray_that_meets_nothing_takes_what_the_views_say_of_its_direction(stre
     encoded = ending_at(encoded, 50.0)  # the views' own rays end far behind all samples
     rays = wall_rays(pose_at(0.0), step=31)
     z = sample_inverse_depth(rays.near_m, rays.far_m, 16)
-    render, said = rendered(field, rays, z, encoded, streaming)
+    render, said = rendered(field, rays, z, encoded, compiled)
     seen = render.known & (render.opacity < 0.1)
     assert seen.float().mean() > 0.5
     torch.testing.assert_close(render.logits[seen], said[0, :, 0, 0].expand(int(seen.sum()), 3), atol=1e-3, rtol=1e-3)
@@ -202,14 +206,14 @@ def test_the_factor_of_the_own_view_leads_from_the_vote_to_the_own_image_alone()
         assert (logits - wanted).abs().max() < (1e-4 if factor > 1e5 else 0.05) * (others - own).abs().max()
 
 
-@pytest.mark.parametrize("streaming", [False, True])
-def test_where_no_view_knows_the_depth_the_query_s_own_view_decides(streaming: bool):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_where_no_view_knows_the_depth_the_query_s_own_view_decides(compiled: bool):
     """The upper half of a street: no scanner reaches it, so what the views believe of its depth is a guess."""
     field = small_field()
     encoded = constant_features(field.encode(wall_sources(POSES)), [1.0, -2.0, 3.0, 0.5])
     encoded = ending_at(encoded, 0.2 * WALL_M)  # all samples are hidden from all views
     rays = wall_rays(POSES[2], step=31)
-    render, said = rendered(field, rays, on_wall(rays), encoded, streaming)
+    render, said = rendered(field, rays, on_wall(rays), encoded, compiled)
     torch.testing.assert_close(render.logits, said[2, :, 0, 0].expand_as(render.logits), atol=1e-2, rtol=1e-2)
 
 

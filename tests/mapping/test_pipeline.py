@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
-from semantic_mapper.fields.checkpoint import load_checkpoint, streaming
+from semantic_mapper.fields.checkpoint import streaming
+from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.fields.weights import default_checkpoint_path
+from semantic_mapper.fields.weights import default_checkpoint_path, load_weights
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
@@ -104,12 +106,12 @@ class CountingField(StreamingSRay):
 
 
 def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
-    trained = load_checkpoint(default_checkpoint_path()).model
+    trained = load_weights(default_checkpoint_path())
     frames = tiny_frames(3)
     updates, rays, pipelines = [], [], []
     for fraction in (1.0, 0.4, 0.4):
         config = tiny_config(render={"encode_width": 64, "ray_fraction": fraction, "scale": 0.5})
-        field = CountingField(trained, config.sampling)
+        field = CountingField(trained.config, trained.label_set, trained.tensors, config.sampling)
         pipeline = MappingPipeline(config, field, trained.label_set)
         updates.append([pipeline.step(f) for f in frames])
         rays.append(field.rays)
@@ -149,7 +151,7 @@ def test_a_field_that_holds_the_scene_is_told_no_depth_but_a_sensors_and_needs_n
     frames = tiny_frames()
     config = tiny_config(keyframes={"use_current_view": False})
     field = SceneField(GridFieldConfig(), ROOMS)
-    pipeline = MappingPipeline(config, field, ROOMS)
+    pipeline = MappingPipeline(config, DeviceField(field, torch.device("cpu"), config.sampling), ROOMS)
     for frame in frames:
         pipeline.step(frame)
     priors = field.__dict__["priors"]

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.mapping.rendering import (
@@ -28,9 +27,9 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
 
 
 class Says:
-    """A field with a given opinion (1, L, h, w) of images."""
+    """A field with a given opinion (h, w, L) of images."""
 
-    def __init__(self, logits: torch.Tensor | None) -> None:
+    def __init__(self, logits: np.ndarray | None) -> None:
         self.logits = logits
 
     def source_logits(self, sources):
@@ -44,7 +43,7 @@ def rendered(probabilities: np.ndarray, known: np.ndarray) -> RenderedView:
 def test_both_opinions_are_joined_as_their_geometric_mean_where_the_view_is_known(rng: np.random.Generator) -> None:
     view_p, own_p = rng.dirichlet(np.ones(4), (3, 5)), rng.dirichlet(np.ones(4), (3, 5))
     known = rng.random((3, 5)) < 0.7
-    field = Says(torch.from_numpy(np.log(own_p)).permute(2, 0, 1)[None])
+    field = Says(np.log(own_p))
     found = add_own_image(rendered(view_p, known), field, None, 0.3)  # type: ignore[arg-type]
     expected = np.maximum(own_p, 1e-4) ** 0.3 * np.maximum(view_p, 1e-4) ** 0.7
     expected /= expected.sum(axis=2, keepdims=True)

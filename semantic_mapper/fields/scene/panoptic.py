@@ -18,6 +18,7 @@ from torch import nn
 
 from semantic_mapper.config import BoxConfig, PanopticConfig, SamplingConfig
 from semantic_mapper.errors import LabelError
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.scene.boxes import Intervals, MovingBoxes, PrimitiveSet, trimmed
 from semantic_mapper.fields.scene.grid import GridField, RaySamples, heaviest, ray_fraction, relu_layers
 from semantic_mapper.fields.scene.irt import at_measured
