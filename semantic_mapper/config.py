@@ -63,6 +63,19 @@ class EncoderConfig(Config, frozen=True):
     # An encoder that has not is shown none: it would be misled.
     computed_depth: bool = False
 
+    def __post_init__(self) -> None:
+        channels, blocks, pretrained = self.channels, self.blocks, self.backbone != "residual"
+        if not channels or len(channels) != len(blocks) or min(channels) < 1 or min(blocks) < 1 - pretrained:
+            raise ConfigError(
+                "encoder: channels and blocks need one positive number a stage each; "
+                f"got {list(channels)} and {list(blocks)}"
+            )
+        if pretrained and (not 2 <= len(channels) <= 5 or blocks[-1] != 0):
+            raise ConfigError(
+                "encoder: this backbone has 2 to 5 stages, the last one without blocks (0); got "
+                f"{list(channels)} and {list(blocks)}"
+            )
+
 
 class SRayConfig(Config, frozen=True):
     """Shape of the S-Ray network; part of every checkpoint."""

@@ -8,9 +8,9 @@ import torch
 
 from research.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
+from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -54,4 +54,4 @@ def tiny_config(**changes: object) -> MapperConfig:
 def tiny_pipeline(**changes: object) -> MappingPipeline:
     """A pipeline of ``tiny_config`` and ``tiny_field``."""
     config = tiny_config(**changes)
-    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,20 +16,20 @@ from research.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.config import MapperConfig, Quality, SamplingConfig, with_quality
 from semantic_mapper.errors import ConfigError, LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.fields.base import Rays, Rendered, WorkingView
 from semantic_mapper.fields.checkpoint import Checkpoint, streaming
 from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.render import View, render_view
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.streaming import StreamingSRay
+from semantic_mapper.fields.streaming import StreamedViews, StreamingSRay
 from semantic_mapper.fields.views import EncodedViews
 from semantic_mapper.fields.volume import sample_guided
-from semantic_mapper.imaging import depth_prior, resize_depth
+from semantic_mapper.imaging import depth_prior, resize_depth, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer
 from semantic_mapper.rays import pixel_grid, pixel_rays
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.training.views import stack_sources, view_from_frame
-from semantic_mapper.types import Bool, CameraIntrinsics, FieldRender, Float32, PosedFrame, RayBatch, SourceViews, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, FieldRender, Float32, PosedFrame, RayBatch, UInt8
 
 VIEW = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
 SOURCE_VIEWS = 8
@@ -122,12 +122,12 @@ def bench_render(
     reference = SRay(checkpoint.model.config, checkpoint.label_set, SamplingConfig(mode="reference"))
     reference.load_state_dict(checkpoint.model.state_dict())
     reference.eval()
-    streaming = streaming(checkpoint.model)
+    fast = streaming(checkpoint.model)
     timings: dict[str, list[Timing]] = {}
     scores: dict[str, ConfusionMatrix] = {}
     difference, encode_s = 0.0, []
     for scene in scenes:
-        found = _bench_scene(scene, reference, streaming, repeats, reference_rays, width=checkpoint.width)
+        found = _bench_scene(scene, reference, fast, repeats, reference_rays, width=checkpoint.width)
         for name, (timing, predicted, truth) in found.renders.items():
             timings.setdefault(name, []).append(timing)
             scores.setdefault(name, ConfusionMatrix(checkpoint.label_set)).update(truth, predicted, name)
@@ -162,37 +162,39 @@ class _SceneBench(NamedTuple):
 
 
 def _bench_scene(
-    scene: BenchScene, reference: SRay, streaming: StreamingSRay, repeats: int, reference_rays: int, width: int
+    scene: BenchScene, reference: SRay, fast: StreamingSRay, repeats: int, reference_rays: int, width: int
 ) -> _SceneBench:
-    query, labels = scene.query, streaming.label_set
-    views = stack_sources([view_from_frame(f, scene.label_set, width) for f in scene.sources])
-    views = replace(views, channel=None)
-    sources, encode = _timed(lambda: streaming.encode(views), SOURCE_VIEWS, repeats)
+    query, labels = scene.query, fast.label_set
+    views = [_working_view(frame, width) for frame in scene.sources]
+    sources, encode = _timed(lambda: fast.stack([fast.encode(view) for view in views]), SOURCE_VIEWS, repeats)
+    torch_field = DeviceField(reference, torch.device("cpu"), SamplingConfig(mode="reference"))
+    encoded = torch_field.stack([torch_field.encode(view) for view in views])
     pixels = pixel_grid(query.intrinsics.width, query.intrinsics.height)
     some = torch.linspace(0, len(pixels) - 1, reference_rays).round().long()
     few, every = _rays(query, pixels[some]), _rays(query, pixels)
-    streaming.sampling = SamplingConfig()
+    fast.sampling = SamplingConfig()
     with torch.inference_mode():
-        slow_render, slow = _timed(lambda: _in_chunks(reference.render, few, sources, 256), reference_rays, 1)
+        slow_render, slow = _timed(lambda: _in_chunks(reference.render, few, encoded, 256), reference_rays, 1)
         eager_render, eager = _timed(
-            lambda: _in_chunks(lambda r, s: _eager(reference, r, s), few, sources, 512), reference_rays, repeats
+            lambda: _in_chunks(lambda r, s: _eager(reference, r, s), few, encoded, 512), reference_rays, repeats
         )
-    few_render = streaming.render(few, sources)
-    _, fast = _timed(lambda: streaming.render(every, sources), len(pixels), repeats)
+    few_render = fast.render(_streamed(few), sources)
+    all_rays = _streamed(every)
+    _, compiled = _timed(lambda: fast.render(all_rays, sources), len(pixels), repeats)
     assert query.label is not None
     truth = labels.to_ids(labels.channel_map_from(scene.label_set)[query.label.reshape(-1)[some.numpy()]])
     renders = {
         "reference": (slow.scaled_to(len(pixels)), _ids(slow_render, labels), truth),
         "eager": (eager.scaled_to(len(pixels)), _ids(eager_render, labels), truth),
-        "streaming": (fast, _ids(few_render, labels), truth),
+        "streaming": (compiled, _ids(few_render, labels), truth),
     }
     if (gpu := find_gpu()) is not None:
         renders |= _bench_device(gpu, reference, views, query, repeats, (some.numpy(), truth))
     for quality in ("balanced", "fast"):
-        view, timing = _timed(lambda q=quality: _sparse(q, streaming, sources, query), len(pixels), repeats)
+        view, timing = _timed(lambda q=quality: _sparse(q, fast, sources, query), len(pixels), repeats)
         predicted = labels.to_ids(np.where(view.known, view.probabilities.argmax(axis=2), -1)).reshape(-1)[some.numpy()]
         renders[quality] = (timing, predicted, truth)
-    difference = float((eager_render.logits - few_render.logits).abs().max())
+    difference = float(np.abs(eager_render.logits.numpy() - few_render.logits).max())
     return _SceneBench(renders, difference, encode.wall_s)
 
 
@@ -204,7 +206,7 @@ def find_gpu() -> torch.device | None:
 def _bench_device(
     device: torch.device,
     model: SRay,
-    views: SourceViews,
+    views: Sequence[WorkingView],
     query: PosedFrame,
     repeats: int,
     scored: tuple[NDArray[np.int64], UInt8],
@@ -216,19 +218,20 @@ def _bench_device(
     renders: dict[str, tuple[Timing, UInt8, UInt8]] = {}
     for name, bfloat16 in (("gpu", False), ("gpu_bfloat16", True)):
         field = DeviceField(model, device, sampling, bfloat16=bfloat16)
-        scene = (field, field.encode(views), query.intrinsics, query.T_world_camera, prior, sampling, 0)
+        sources = field.stack([field.encode(view) for view in views])
+        scene = (field, sources, query.intrinsics, query.T_world_camera, prior, sampling, 0)
         (p, known, _), timing = _timed(lambda s=scene: render_view(View(*s, measured)), prior.size, repeats)
         predicted = model.label_set.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some]
         renders[name] = (timing, predicted, truth)
     return renders
 
 
-def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, query: PosedFrame) -> RenderedView:
+def _sparse(quality: Quality, fast: StreamingSRay, sources: StreamedViews, query: PosedFrame) -> RenderedView:
     """The whole view as the mapper renders it at a quality."""
     config = with_quality(MapperConfig(quality=quality))
     prior, measured = query_prior(query)
-    renderer = ViewRenderer(streaming, config.render, config.sampling)
-    view = View(streaming, sources, query.intrinsics, query.T_world_camera, prior, config.sampling, 0, measured)
+    renderer = ViewRenderer(fast, config.render, config.sampling)
+    view = View(fast, sources, query.intrinsics, query.T_world_camera, prior, config.sampling, 0, measured)
     return renderer.render(view, query.rgb)
 
 
@@ -236,6 +239,19 @@ def query_prior(query: PosedFrame) -> tuple[Float32, Bool]:
     """Depth prior (H, W) of the view as the mapper draws it, and where it is measured."""
     depth = resize_depth(query, query.intrinsics)
     return depth_prior(depth, query.rgb), depth > 0
+
+
+def _working_view(frame: PosedFrame, width: int) -> WorkingView:
+    k = working_intrinsics(frame.intrinsics, width)
+    rgb, depth_m, spread = resize_rgb(frame, k), resize_depth(frame, k), resize_spread(frame, k)
+    return WorkingView(rgb, depth_m, k, frame.T_world_camera, depth_sigma_m=spread)
+
+
+def _streamed(rays: RayBatch) -> Rays:
+    assert rays.measured is not None
+    tensors = rays.origin, rays.direction, rays.prior_depth_m, rays.measured
+    origin, direction, prior, measured = (np.ascontiguousarray(t.numpy()) for t in tensors)
+    return Rays(origin, direction, float(rays.near_m[0]), float(rays.far_m[0]), prior, measured)
 
 
 def _eager(field: SRay, rays: RayBatch, sources: EncodedViews) -> FieldRender:
@@ -277,8 +293,8 @@ def _timed(work: Callable[[], ResultT], rays: int, repeats: int) -> tuple[Result
     return result, best
 
 
-def _ids(render: FieldRender, label_set: LabelSet) -> UInt8:
-    return label_set.to_ids(np.where(render.known.numpy(), render.logits.argmax(1).numpy(), -1))
+def _ids(render: FieldRender | Rendered, label_set: LabelSet) -> UInt8:
+    return label_set.to_ids(np.where(np.asarray(render.known), np.asarray(render.logits).argmax(1), -1))
 
 
 def _row(timing: Timing, intrinsics: CameraIntrinsics) -> dict[str, float]:

@@ -310,8 +310,9 @@ def _bundle() -> Mapper:
     model = SRay(SRayConfig(feature_dim=16, heads=2, encoder=encoder), ROOMS).eval()
     config = convert_config(CONFIG, MapperConfig, "fuzz")
     recipe = {"kind": "random", "width": 32, "train_stamps_ns": []}
-    pipeline = MappingPipeline(config, make_field(model, config), ROOMS)
-    return Mapper(pipeline, Checkpoint(model, (), recipe), Path("random.safetensors"))
+    weights = Checkpoint(model, (), recipe).weights
+    pipeline = MappingPipeline(config, make_field(weights, config), ROOMS)
+    return Mapper(pipeline, weights, Path("random.safetensors"))
 
 
 def _session(bundle: Mapper) -> MapSession:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
@@ -33,7 +32,7 @@ from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON
 from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.evaluation.upright import camera_up, upright_rotation
-from semantic_mapper.fields.views import EncodedViews
+from semantic_mapper.fields.base import CHUNK, Rays, Rendered, WorkingView
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapper import Mapper
@@ -41,17 +40,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.overview import draw_points, from_above
-from semantic_mapper.types import (
-    Bool,
-    CameraIntrinsics,
-    FieldRender,
-    Float32,
-    Float64,
-    PosedFrame,
-    RayBatch,
-    SourceViews,
-    UInt8,
-)
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 FIRST = 15  # frames before answers count: the map has to see free space first
 NEAR_M, APART_M = 0.05, 0.06  # a ghost is this near to where a thing was, and this far from all that stays
@@ -106,34 +95,48 @@ class Stretch(NamedTuple):
     still: Iterator[Seen]
 
 
+class NoView:
+    """What ``FrameLabels`` keeps of a view."""
+
+    size = (), ()
+
+    def at(self, T_world_camera: Float64) -> NoView:
+        """The same from anywhere."""
+        return self
+
+
 class FrameLabels:
     """A field that knows the true classes of one frame, and nothing else: the cheapest there is."""
 
     def __init__(self, label_set: LabelSet) -> None:
         self.label_set = label_set
+        self.holds_scene, self.rays_per_chunk = False, CHUNK
         self.sampling = SamplingConfig()
         self.frame: PosedFrame | None = None
 
-    def encode(self, views: SourceViews) -> EncodedViews:
-        """Nothing of the views is kept."""
-        none = torch.zeros((len(views.K), 1, 1, 1))
-        return EncodedViews(none, none.expand(-1, 3, -1, -1), none, views.K, views.T_world_camera, none[:, 0].short())
+    def encode(self, view: WorkingView) -> NoView:
+        """Nothing of the view is kept."""
+        return NoView()
 
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+    def stack(self, views: Sequence[NoView]) -> NoView:
+        """Nothing is kept."""
+        return views[0]
+
+    def render(self, rays: Rays, sources: NoView) -> Rendered:
         """The label of the pixel that each ray of ``self.frame`` goes through."""
         assert self.frame is not None and self.frame.label is not None
         k, (h, w) = self.frame.intrinsics, self.frame.label.shape
-        x, y, z = (rays.direction.double().numpy() @ self.frame.T_world_camera[:3, :3]).T
+        x, y, z = (rays.direction.astype(np.float64) @ self.frame.T_world_camera[:3, :3]).T
         u, v = np.rint(k.fx * x / z + k.cx), np.rint(k.fy * y / z + k.cy)
         label = self.frame.label[np.clip(v, 0, h - 1).astype(int), np.clip(u, 0, w - 1).astype(int)]
-        channel = torch.from_numpy(self.label_set.to_channels(label))
+        channel = self.label_set.to_channels(label)
         known = channel >= 0
-        logits = torch.zeros((len(label), len(self.label_set)))
+        logits = np.zeros((len(label), len(self.label_set)), np.float32)
         logits[known, channel[known]] = 8.0
-        depth, zero = rays.prior_depth_m, torch.zeros(len(label))
-        return FieldRender(logits, depth, (depth > 0).float(), zero[:, None].expand(-1, 3), zero, known)
+        depth = rays.prior_depth_m
+        return Rendered(logits, depth, (depth > 0).astype(np.float32), np.zeros((len(label), 3), np.float32), known)
 
-    def source_logits(self, sources: EncodedViews) -> None:
+    def source_logits(self, sources: NoView) -> None:
         """No opinion."""
 
 

@@ -23,15 +23,16 @@ from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.checkpoint import load_checkpoint
-from semantic_mapper.fields.domain_check import STATISTICS, UNLIKE, WIDTH, backbone_digest
+from semantic_mapper.fields.domain_check import STATISTICS, UNLIKE, backbone_digests
 from semantic_mapper.fields.encoder import EfficientNetLite0
-from semantic_mapper.fields.weights import default_checkpoint_path
+from semantic_mapper.fields.streaming import PICTURE_WIDTH
+from semantic_mapper.fields.weights import default_checkpoint_path, load_weights
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.types import Float64, UInt8
 
-SIZE = (WIDTH, 120)  # as the weights see pictures
+SIZE = (PICTURE_WIDTH, 120)  # as the weights see pictures
 SEEDS, VIEWS, STEP_M = range(51_000, 51_450), 3, 0.35  # training rooms, and views of each
 VARIETY, PEOPLE = 0.4, 0.3  # of run 6 of the shipped weights
 SHRINKAGE = 0.01  # of the covariance to a multiple of the identity
@@ -79,7 +80,8 @@ def _write_statistics(_: Sequence[str]) -> None:
     spread += SHRINKAGE * np.trace(spread) / len(spread) * np.eye(len(spread))
     whiten = np.linalg.cholesky(np.linalg.inv(spread)).T / np.sqrt(len(spread))
     arrays = {"mean": found.mean(0).astype(np.float32), "whiten": whiten.astype(np.float32)}
-    np.savez_compressed(STATISTICS, **arrays, backbone=backbone_digest(_backbone()))
+    (digest,) = backbone_digests(load_weights(default_checkpoint_path()))
+    np.savez_compressed(STATISTICS, **arrays, backbone=digest)
     print(f"{STATISTICS}: of {len(found)} pictures of {len(SEEDS)} rooms")
 
 
@@ -118,7 +120,7 @@ def _show_pictures(sources: Sequence[str]) -> None:
     assert check is not None, "run `statistics` first"
     print("| pictures | count | distance: 5 % | median | 95 % | unlike |\n|---|---|---|---|---|---|")
     for name, _, path in (source.partition("=") for source in sources):
-        found = [check.distance(torch.from_numpy(f).float()) for f in _features(_pictures_at(path))]
+        found = [check.distance(f.astype(np.float32)) for f in _features(_pictures_at(path))]
         low, middle, high, unlike = *np.percentile(found, (5, 50, 95)), np.mean(np.greater(found, UNLIKE))
         print(f"| {name} | {len(found)} | {low:.2f} | {middle:.2f} | {high:.2f} | {unlike:.0%} |")
 

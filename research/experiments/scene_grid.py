@@ -27,6 +27,7 @@ from research.peers.semantic_nerf import config_for_scene
 from research.scenes import VALIDATION_SEEDS, NoiseConfig
 from research.scenes.sequence import room_views
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
+from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.scene.grid import GridField
@@ -104,11 +105,11 @@ def _as_field(state: dict[str, torch.Tensor], config: GridFieldConfig, steps: in
 def _render(field: LearnedField, frame: PosedFrame) -> tuple[Float32, Float32]:
     """Colour and depth of a view, without a depth prior."""
     k = frame.intrinsics
-    field.sampling = FREE
     sources = field.encode(stack_sources([view_from_frame(frame, ROOMS, k.width)]))
+    renderer = DeviceField(field, torch.device("cpu"), FREE)
     none = np.zeros((k.height, k.width), np.float32)
-    found = render_image(View(field, sources, k, frame.T_world_camera, none, FREE))
-    return found.rgb.view(k.height, k.width, 3).numpy(), found.depth_m.view(k.height, k.width).numpy()
+    found = render_image(View(renderer, sources, k, frame.T_world_camera, none, FREE))
+    return found.rgb.reshape(k.height, k.width, 3), found.depth_m.reshape(k.height, k.width)
 
 
 def _psnr(frames: Sequence[PosedFrame], renders: Sequence[tuple[Float32, Float32]], *, gain: bool = False) -> float:

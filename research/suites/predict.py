@@ -10,18 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from research.suites.config import TierConfig
-from semantic_mapper.config import SamplingConfig
-from semantic_mapper.fields.checkpoint import streaming
-from semantic_mapper.fields.device import to_device
+from semantic_mapper.fields.base import Rendered
+from semantic_mapper.fields.checkpoint import streamed, streaming
+from semantic_mapper.fields.device import DeviceField, to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import View, render_image
+from semantic_mapper.fields.render import View, render_image, softmax
 from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.views import SemanticField
 from semantic_mapper.imaging import depth_prior, fill_holes, resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
-from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,35 +63,29 @@ def predict_view(
         sampling = around_computed(sampling)
     views = [view_from_frame(frame, field.label_set, query.intrinsics.width) for frame in sources]
     labelled = any(frame.label is not None for frame in sources)
-    renderer = _renderer(field, sampling, device)
     with torch.inference_mode():
-        encoded = renderer.encode(to_device(stack_sources(views, with_labels=labelled), device))
+        encoded = field.encode(to_device(stack_sources(views, with_labels=labelled), device))
+    field.sampling = sampling
+    # The compiled renderer gives the same answer. Exactly this class: a kind derived from it renders in its own way.
+    compiled = type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming"
+    renderer = streaming(field, sampling) if compiled else DeviceField(field, device, sampling)
+    found = streamed(encoded) if compiled else encoded
     depth_m = resize_depth(query, query.intrinsics)
     shown = any(frame is query for frame in sources)
     prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
-    scene = (renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
+    scene = (renderer, found, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
     render = render_image(View(*scene, measured=depth_m > 0, stamp_ns=query.stamp_ns))
     return _as_prediction(render, field.label_set, label_set, (query.intrinsics.height, query.intrinsics.width))
 
 
-def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.device) -> SemanticField:
-    """The compiled renderer for S-Ray where it covers the case (it gives the same answer), else the field itself."""
-    field.sampling = sampling
-    # Exactly this class: a kind derived from it renders in its own way.
-    if type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming":
-        return streaming(field, sampling)
-    return field
-
-
-def _as_prediction(render: FieldRender, own_set: LabelSet, label_set: LabelSet, size: tuple[int, int]) -> Prediction:
-    confidence, channel = torch.softmax(render.logits.float(), dim=-1).max(dim=-1)
-    known = render.known.cpu().numpy()
-    own_ids = own_set.to_ids(np.where(known, channel.cpu().numpy(), IGNORE_CHANNEL))
+def _as_prediction(render: Rendered, own_set: LabelSet, label_set: LabelSet, size: tuple[int, int]) -> Prediction:
+    probabilities = softmax(render.logits)
+    own_ids = own_set.to_ids(np.where(render.known, probabilities.argmax(axis=1), IGNORE_CHANNEL))
     label = label_set.to_ids(label_set.channel_map_from(own_set)[own_ids])
     return Prediction(
         label.reshape(size),
-        confidence.cpu().numpy().reshape(size),
-        render.rgb.float().clamp(0, 1).cpu().numpy().reshape(*size, 3),
-        render.depth_m.float().cpu().numpy().reshape(size),
-        known.reshape(size),
+        probabilities.max(axis=1).reshape(size),
+        render.rgb.clip(0, 1).reshape(*size, 3),
+        render.depth_m.reshape(size),
+        render.known.reshape(size),
     )

@@ -27,7 +27,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from research.suites.entries import load_entries
 from semantic_mapper.errors import ConfigError, SemanticMapperError, WeightsError
@@ -147,8 +149,8 @@ def ship_on_base(half: Path, out: Path) -> None:
     save_tensors(own, out, metadata | {"base": base.stem})
 
 
-def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
-    return a.dtype == b.dtype and torch.equal(a, b)
+def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    return a.dtype == b.dtype and np.array_equal(a, b)
 
 
 def as_stored(tensor: torch.Tensor, name: str) -> torch.Tensor:

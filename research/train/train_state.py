@@ -94,7 +94,7 @@ def save_state(
         "origins": json.dumps(progress.origins),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_tensors({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, path, metadata)
+    save_tensors({name: t.detach().cpu().contiguous().numpy().copy() for name, t in tensors.items()}, path, metadata)
 
 
 def unfinished_step(path: Path) -> int | None:

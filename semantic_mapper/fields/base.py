@@ -18,6 +18,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, UInt8
 
 MAX_SOURCE_VIEWS = 16
+CHUNK = 2048  # rays rendered at once on a CPU: what fits in a core's cache
 EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # of the feature and the label maps
 
 
@@ -81,6 +82,11 @@ class StreamField(Protocol[EncodedT]):
     @property
     def holds_scene(self) -> bool:
         """Whether its density is the geometry of the one scene that it was fitted to."""
+        ...
+
+    @property
+    def rays_per_chunk(self) -> int:
+        """Rays to render at once."""
         ...
 
     sampling: SamplingConfig  # where ``render`` samples rays; may be exchanged between two renders

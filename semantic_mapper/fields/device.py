@@ -16,9 +16,8 @@ from torch import nn
 
 from semantic_mapper.config import DeviceName, SamplingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import Rays, Rendered, WorkingView
+from semantic_mapper.fields.base import CHUNK, Rays, Rendered, WorkingView
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.render import CHUNK
 from semantic_mapper.fields.views import EncodedViews, stack_views
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.labels import LabelSet
@@ -104,13 +103,15 @@ class DeviceField:
     """Inference-only field of torch on a device. Satisfies ``StreamField``.
 
     Weights, features of keyframes and rays stay on the device. Sums on a GPU come in no fixed order: its renders repeat
-    but for the last digits. The model is copied on a GPU; with ``bfloat16`` its ``BFLOAT16_PARTS`` compute in that.
+    but for the last digits. A model on the device is shared; with ``bfloat16`` ``BFLOAT16_PARTS`` of a copy compute in
+    that.
     """
 
     def __init__(
         self, model: LearnedField, device: torch.device, sampling: SamplingConfig, *, bfloat16: bool = False
     ) -> None:
-        self.model = (model if device.type == "cpu" else copy.deepcopy(model).to(device)).eval()
+        shared = not bfloat16 and next(model.parameters()).device.type == device.type
+        self.model = (model if shared else copy.deepcopy(model).to(device)).eval()
         self.device = device
         self.sampling = sampling
         torch.backends.cudnn.allow_tf32 = False  # torch's default rounds convolutions to 10 bits, those of depths, too
@@ -125,7 +126,7 @@ class DeviceField:
 
     @property
     def rays_per_chunk(self) -> int:
-        """Rays to render at once."""
+        """As many as the device has memory for."""
         sampling = self.sampling
         samples = sampling.guided if sampling.mode == "streaming" else sampling.coarse + sampling.fine
         return CHUNK if self.device.type == "cpu" else max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))

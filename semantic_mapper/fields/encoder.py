@@ -20,7 +20,6 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.numbers import (
     BACKBONE_DEVIATION,
     BACKBONE_MEAN,
@@ -202,24 +201,10 @@ class ImageEncoder(nn.Module):
     makes of it next to the colours, and one for views without. A single network for both would do either less well.
     Statistics of batch norm come from the images only inside ``batch_statistics`` (training on many images at once);
     else, in training mode too, they are constants, so that a view's features do not depend on the views next to it.
-    Raises ConfigError: a shape that cannot be built.
     """
 
     def __init__(self, config: EncoderConfig, feature_dim: int) -> None:
         super().__init__()
-        channels, blocks = config.channels, config.blocks
-        pretrained = config.backbone == "efficientnet-lite0"
-        least = 0 if pretrained else 1
-        if not channels or len(channels) != len(blocks) or min(*channels, feature_dim) < 1 or min(blocks) < least:
-            raise ConfigError(
-                "encoder: channels and blocks need one positive number a stage each, and feature_dim has to be "
-                f"positive; got {list(channels)}, {list(blocks)} and {feature_dim}"
-            )
-        if pretrained and (not 2 <= len(channels) <= len(BACKBONE_WIDTHS) or blocks[-1] != 0):
-            raise ConfigError(
-                f"encoder: this backbone has 2 to {len(BACKBONE_WIDTHS)} stages, the last one without blocks (0); got "
-                f"{list(channels)} and {list(blocks)}"
-            )
         self.colour_net = UNet(COLOURS, config, feature_dim)
         self.depth_net = UNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self.takes_computed_depth = config.depth and config.computed_depth

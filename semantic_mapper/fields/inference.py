@@ -33,6 +33,7 @@ from semantic_mapper.fields.numbers import (
     SURFACE_CHANNELS,
     TORCH_NORM_EPSILON,
 )
+from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels.binding import thread_count
 from semantic_mapper.types import Float32, UInt8
 
@@ -76,7 +77,7 @@ class ImageNetwork:
 
 
 def check_networks(tensors: Mapping[str, Array], config: SRayConfig) -> None:
-    """Raises KeyError: a tensor is missing; its name. RuntimeError: tensors do not fit together, or the config."""
+    """Raises KeyError: a tensor is missing; its name. ShapeError: one is of another shape than the config asks for."""
     for with_depth in (False, True)[: 1 + config.encoder.depth]:
         _Builder(tensors, config).build((64, 64), (32, 32), with_depth=with_depth)
 
@@ -118,13 +119,12 @@ class _Builder:
         picture: Node = ops.constant(np.zeros((1, 0), np.float32))
         if pretrained:
             maps = self._backbone(f"{name}.backbone", photo, size, count)
-            skips = [self._conv(f"{name}.laterals.{i}", each) for i, each in enumerate(maps)]
+            skips = [self._conv(f"{name}.laterals.{i}", each, config.channels[i], 1) for i, each in enumerate(maps)]
             picture = ops.reduce_mean(maps[-1], [2, 3])
-        x = ops.relu(self._conv(f"{name}.stem", seen, stride=2, pad=2))
+        x = ops.relu(self._conv(f"{name}.stem", seen, config.channels[0], 5, stride=2))
         for i in range(count - pretrained):
-            x = self._residual(f"{name}.stages.{i}.0", x, 2 if i > 0 else 1)
-            for k in range(1, blocks[i]):
-                x = self._residual(f"{name}.stages.{i}.{k}", x, 1)
+            for k in range(max(1, blocks[i])):
+                x = self._residual(f"{name}.stages.{i}.{k}", x, config.channels[i], 2 if i > 0 and k == 0 else 1)
             if pretrained:
                 skips[i] = skips[i] + x
             else:
@@ -133,23 +133,23 @@ class _Builder:
         x = skips.pop()
         for up, i in enumerate(reversed(range(count - 1))):
             x = self._up(f"{name}.ups.{up}", x, skips.pop(), refine[i])
-        return self._conv(f"{name}.head", x, pad=1), picture
+        return self._conv(f"{name}.head", x, self._config.feature_dim, 3), picture
 
     def _backbone(self, name: str, photo: Node, size: tuple[int, int], stages: int) -> list[Node]:
         """Feature maps at strides 2, 4, ..., the finest first; see ``EfficientNetLite0``."""
-        x, size = self._strided(f"{name}.stem", photo, size)
+        x, size = self._strided(f"{name}.stem", photo, size, BACKBONE_STAGES[0][0][0], 3)
         x = ops.clamp(x, 0.0, 6.0)
         maps: list[Node] = []
         for i, stage in enumerate(BACKBONE_STAGES[:stages]):
             for k, (c_in, c_out, kernel, stride, expansion) in enumerate(stage):
-                block, y = f"{name}.stages.{i}.{k}", x
+                block, y, inner = f"{name}.stages.{i}.{k}", x, c_in * expansion
                 if expansion > 1:
-                    y = ops.clamp(self._normed(f"{block}.expand", y), 0.0, 6.0)
+                    y = ops.clamp(self._normed(f"{block}.expand", y, inner, 1), 0.0, 6.0)
                 if stride == 2:
-                    y, size = self._strided(f"{block}.depthwise", y, size, groups=c_in * expansion)
+                    y, size = self._strided(f"{block}.depthwise", y, size, inner, kernel, groups=inner)
                 else:
-                    y = self._normed(f"{block}.depthwise", y, pad=kernel // 2, groups=c_in * expansion)
-                y = self._normed(f"{block}.project", ops.clamp(y, 0.0, 6.0))
+                    y = self._normed(f"{block}.depthwise", y, inner, kernel, groups=inner)
+                y = self._normed(f"{block}.project", ops.clamp(y, 0.0, 6.0), c_out, 1)
                 x = x + y if stride == 1 and c_in == c_out else y
             maps.append(x)
         return maps
@@ -160,8 +160,8 @@ class _Builder:
         near = ops.maximum(depth, _f(NEAR_M))
         inverse = ops.select(measured, _f(1) / near, _f(0))
         x = ops.concat([feature, inverse, ops.convert(measured, np.float32)], 1)
-        x = ops.relu(self._conv("geometry_init.net.0", x, pad=1))
-        raw = self._conv("geometry_init.net.2", x, pad=1)
+        x = ops.relu(self._conv("geometry_init.net.0", x, 16, 3))
+        raw = self._conv("geometry_init.net.2", x, GEOMETRY_CHANNELS + 1, 3)
         shift, widen, behind, widen_behind, fraction, guess = (
             ops.slice(raw, [i], [i + 1], [1], [1]) for i in range(GEOMETRY_CHANNELS + 1)
         )
@@ -175,47 +175,57 @@ class _Builder:
         s_2 = mu_2 * _f(PREDICTED_SCALE) * ops.exp(ops.clamp(widen_behind, -3.0, 3.0))
         return ops.concat([mu_1, s_1, mu_2, s_2, ops.sigmoid(fraction + _f(3.0))], 1)
 
-    def _residual(self, name: str, x: Node, stride: int) -> Node:
-        y = ops.relu(self._normed(f"{name}.conv1", x, stride=stride, pad=1, norm=f"{name}.norm1"))
-        y = self._normed(f"{name}.conv2", y, pad=1, norm=f"{name}.norm2")
+    def _residual(self, name: str, x: Node, out: int, stride: int) -> Node:
+        y = ops.relu(self._normed(f"{name}.conv1", x, out, 3, stride=stride, norm=f"{name}.norm1"))
+        y = self._normed(f"{name}.conv2", y, out, 3, norm=f"{name}.norm2")
         if stride > 1:
             x = ops.avg_pool(x, [stride] * 2, [0, 0], [0, 0], [stride] * 2, True, "ceil")
-        if f"{name}.shortcut.weight" in self._tensors:
-            x = self._conv(f"{name}.shortcut", x)
+        if stride > 1 or _channels(x) != out:
+            x = self._conv(f"{name}.shortcut", x, out, 1)
         return ops.relu(y + x)
 
     def _up(self, name: str, x: Node, skip: Node, refine: int) -> Node:
-        height, width = list(skip.get_output_shape(0))[2:]
-        x = self._conv(f"{name}.reduce", x)
+        _, out, height, width = skip.get_output_shape(0)
+        x = self._conv(f"{name}.reduce", x, out, 1)
         x = ops.interpolate(
             x, np.array([2.0, 2.0], np.float32), "nearest", "scales", axes=np.array([2, 3]),
             coordinate_transformation_mode="asymmetric", nearest_mode="floor",
         )  # fmt: skip
         x = ops.slice(x, [0, 0], [height, width], [1, 1], [2, 3]) + skip
         for i in range(refine):
-            x = self._residual(f"{name}.refine" if refine == 1 else f"{name}.refine.{i}", x, 1)
+            x = self._residual(f"{name}.refine" if refine == 1 else f"{name}.refine.{i}", x, out, 1)
         return x
 
-    def _strided(self, name: str, x: Node, size: tuple[int, int], groups: int = 1) -> tuple[Node, tuple[int, int]]:
+    def _strided(
+        self, name: str, x: Node, size: tuple[int, int], out: int, kernel: int, *, groups: int = 1
+    ) -> tuple[Node, tuple[int, int]]:
         """Of stride 2, padded as TensorFlow's "SAME" pads; see ``StridedConvolution``."""
-        pads = [self._tensors[f"{name}.weight"].shape[-1] - 2 + side % 2 for side in size]
+        pads = [kernel - 2 + side % 2 for side in size]
         begin, end = [p // 2 for p in pads], [p - p // 2 for p in pads]
-        x = self._normed(name, x, stride=2, pad=(begin, end), groups=groups)
+        x = self._normed(name, x, out, kernel, stride=2, pads=(begin, end), groups=groups)
         return x, ((size[0] + 1) // 2, (size[1] + 1) // 2)
 
-    def _normed(self, name: str, x: Node, *, norm: str = "", **options: Any) -> Node:
+    def _normed(
+        self, name: str, x: Node, out: int, kernel: int, *, norm: str = "", groups: int = 1, **options: Any
+    ) -> Node:
         """A convolution with the batch norm after it folded in."""
         epsilon = TORCH_NORM_EPSILON if norm else NORM_EPSILON  # of residual blocks; of the backbone
         norm = norm or f"{name}_norm"
         gamma, beta, mean, var = (
-            self._tensors[f"{norm}.{n}"].astype(np.float64) for n in ("weight", "bias", "running_mean", "running_var")
+            self._tensor(f"{norm}.{n}", out).astype(np.float64)
+            for n in ("weight", "bias", "running_mean", "running_var")
         )
         scale = gamma / np.sqrt(var + epsilon)
-        weight = self._tensors[f"{name}.weight"] * scale[:, None, None, None]
-        return self._convolve(x, weight, beta - mean * scale, **options)
+        weight = self._tensor(f"{name}.weight", out, _channels(x) // groups, kernel, kernel)
+        return self._convolve(x, weight * scale[:, None, None, None], beta - mean * scale, groups=groups, **options)
 
-    def _conv(self, name: str, x: Node, **options: Any) -> Node:
-        return self._convolve(x, self._tensors[f"{name}.weight"], self._tensors[f"{name}.bias"], **options)
+    def _conv(self, name: str, x: Node, out: int, kernel: int, *, stride: int = 1) -> Node:
+        weight = self._tensor(f"{name}.weight", out, _channels(x), kernel, kernel)
+        return self._convolve(x, weight, self._tensor(f"{name}.bias", out), stride=stride)
+
+    def _tensor(self, name: str, *shape: int) -> Array:
+        expect_shape(self._tensors[name], " ".join(map(str, shape)), f"'{name}'")
+        return self._tensors[name]
 
     def _convolve(
         self,
@@ -224,16 +234,19 @@ class _Builder:
         bias: Array,
         *,
         stride: int = 1,
-        pad: int | tuple[list[int], list[int]] = 0,
+        pads: tuple[list[int], list[int]] | None = None,
         groups: int = 1,
     ) -> Node:
-        begin, end = ([pad] * 2, [pad] * 2) if isinstance(pad, int) else pad
-        shape = [stride] * 2, begin, end, [1, 1]
+        shape = [stride] * 2, *(pads or ([weight.shape[-1] // 2] * 2,) * 2), [1, 1]
         if groups == 1:
             y = ops.convolution(x, _f(weight), *shape)
         else:
             y = ops.group_convolution(x, _f(weight.reshape(groups, -1, *weight.shape[1:])), *shape)
         return y + _f(bias.reshape(1, -1, 1, 1))
+
+
+def _channels(x: Node) -> int:
+    return list(x.get_output_shape(0))[1]
 
 
 def _f(value: float | Array) -> Node:

@@ -429,7 +429,7 @@ def save_nesf(weights: NesfWeights, path: Path) -> None:
     """Write weights as float16, whole or not at all."""
     model = weights.model
     metadata = describe(MAP_KIND, model.config, model.label_set, weights.recipe)
-    tensors = {name: t.detach().half().contiguous() for name, t in model.state_dict().items()}
+    tensors = {name: t.detach().half().contiguous().numpy() for name, t in model.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_tensors(tensors, path, metadata)
 

@@ -20,7 +20,6 @@ from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-CHUNK = 2048  # rays rendered at once on a CPU: what fits in a core's cache; a field may say otherwise
 COARSEST = 4  # pixels between the first rays, a power of two
 
 
@@ -34,14 +33,14 @@ class View:
     T_world_camera: Float64
     prior_depth_m: Float32  # (H, W), 0 = no prior
     sampling: SamplingConfig  # for its near and far bounds
-    rays_per_chunk: int = 0  # rendered at once; 0 = what suits the device
+    rays_per_chunk: int = 0  # rendered at once; 0 = what suits the field
     measured: NDArray[np.bool_] | None = None  # (H, W), where the prior is not filled in; None = wherever there is one
     stamp_ns: int | None = None  # for fields with things that move; None = such things are not there
 
     def trace(self, flat: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Rendered]]:
         """Pixels ``flat`` (R,), row by row, and what they render to, chunk by chunk."""
         T, k, prior = self.T_world_camera.astype(np.float32), self.intrinsics, self.prior_depth_m
-        size = self.rays_per_chunk or getattr(self.field, "rays_per_chunk", CHUNK)
+        size = self.rays_per_chunk or self.field.rays_per_chunk
         for start in range(0, len(flat), size):
             part = flat[start : start + size]
             v, u = np.divmod(part, k.width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError, WeightsError
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedSize, Rays, Rendered, WorkingView
+from semantic_mapper.fields.base import CHUNK, MAX_SOURCE_VIEWS, EncodedSize, Rays, Rendered, WorkingView
 from semantic_mapper.fields.inference import ImageNetwork, check_networks
 from semantic_mapper.fields.numbers import (
     BACKGROUND_M,
@@ -70,6 +70,9 @@ class StreamingSRay:
     ``like``: one whose encoder has the same weights (``weights.encode_alike``), whose networks are shared.
     Raises WeightsError: tensors that do not fit the config."""
 
+    holds_scene = False  # it knows no scene but by its views
+    rays_per_chunk = CHUNK
+
     def __init__(
         self,
         config: SRayConfig,
@@ -83,22 +86,20 @@ class StreamingSRay:
         self.label_set = label_set
         self.sampling = sampling or SamplingConfig()
         self.picture: Float32 | None = None  # (D,) of the view that was encoded last; see ``domain_check``
+        read = _Read(tensors)
         try:
-            check_networks(tensors, config)
-            self._weights = _pack_weights(tensors, config, len(label_set))
-        except (KeyError, RuntimeError, ShapeError) as error:
-            reason = f"there is no {error}" if isinstance(error, KeyError) else str(error).splitlines()[-1]
+            check_networks(read, config)
+            self._weights = _pack_weights(read, config, len(label_set))
+        except (KeyError, ShapeError) as error:
+            reason = f"there is no {error}" if isinstance(error, KeyError) else str(error)
             raise WeightsError(f"weights do not fit their model config: {reason}") from error
+        if others := [n for n in tensors if n not in read.names and not n.endswith(".num_batches_tracked")]:
+            raise WeightsError(f"weights do not fit their model config: it has no '{others[0]}'")
         self._tensors = tensors
         self._networks: dict[tuple[int, int, bool], ImageNetwork] = like._networks if like else {}
         at_surface = config.tokens == "surface"
         self._settings = _Settings(config.heads, at_surface, COLOUR_SCALE if at_surface else 0.0)
         self._own_factors = tensors["own_view_factor"] if at_surface else np.ones(2, np.float32)
-
-    @property
-    def holds_scene(self) -> bool:
-        """It knows no scene but by its views."""
-        return False
 
     def encode(self, view: WorkingView) -> StreamedViews:
         """As ``SRay.encode``. Raises ShapeError: arrays that do not fit together."""
@@ -141,7 +142,8 @@ class StreamingSRay:
             raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
         rows, columns = max(v.channel.shape[1:] for v in views)
         channel = [labels for v in views for labels in _labels(v, rows, columns)]
-        return StreamedViews(*map(np.concatenate, zip(*(v[:-1] for v in views), strict=True)), np.stack(channel))
+        maps = map(np.concatenate, zip(*(v[:-1] for v in views), strict=True))
+        return StreamedViews(*maps, channel=np.stack(channel))
 
     def source_logits(self, sources: StreamedViews) -> Float32:
         """Logits (h, w, L) of an encoded image by itself."""
@@ -189,6 +191,18 @@ class StreamingSRay:
         if key not in self._networks:
             self._networks[key] = ImageNetwork(self._tensors, self.config, (height, width), with_depth=with_depth)
         return self._networks[key]
+
+
+class _Read(dict[str, NDArray[Any]]):
+    """Tensors, and the ``names`` of those that were read."""
+
+    def __init__(self, tensors: Tensors) -> None:
+        super().__init__(tensors)
+        self.names: set[str] = set()
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        self.names.add(name)
+        return super().__getitem__(name)
 
 
 class _Rays(NamedTuple):
@@ -303,14 +317,14 @@ def _pack_weights(tensors: Tensors, config: SRayConfig, classes: int) -> _Weight
         return _Layer((matrix if two else transposed)(weight, out, size), tensors[f"{name}.bias"].astype(np.float32))
 
     def attention(name: str, there: bool) -> _Attention:
-        none = np.zeros((0, 0), np.float32)
-        if not there:
-            return _Attention(none, none)
-        return _Attention(transposed(f"{name}.qkv.weight", 3 * dim, dim), transposed(f"{name}.out.weight", dim, dim))
+        found = transposed(f"{name}.qkv.weight", 3 * dim, dim), transposed(f"{name}.out.weight", dim, dim)
+        return _Attention(*(matrix if there else matrix[:0, :0] for matrix in found))
 
     matrix("classifier.weight", classes, dim)
     expect_shape(tensors["classifier.bias"], f"{classes}", "'classifier.bias'")
-    _ = tensors["label_logit"], tensors["own_view_factor"] if config.tokens == "surface" else None
+    expect_shape(tensors["label_logit"], "", "'label_logit'")
+    if config.tokens == "surface":
+        expect_shape(tensors["own_view_factor"], "2", "'own_view_factor'")
     return _Weights(
         radial=attention("radial", config.intra_view_attention),
         cross=attention("cross", config.cross_view_attention),

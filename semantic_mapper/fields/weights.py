@@ -99,7 +99,7 @@ def shipped_checkpoint(name: Path) -> Path | None:
 def weights_bytes(weights: WeightsFile, *, half: bool = False) -> bytes:
     """The content of a weights file; with ``half`` weights are float16.
     Raises SafetensorError: tensors that the format does not know."""
-    tensors = {f"model.{name}": np.ascontiguousarray(t) for name, t in weights.tensors.items()}
+    tensors = {f"model.{name}": np.asarray(t, order="C") for name, t in weights.tensors.items()}
     if half:
         for name, tensor in tensors.items():
             # Not poses (float64), which it would move, nor running variances, which span more powers of ten.

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -9,8 +10,16 @@ from safetensors.torch import save_file
 
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.weights import COMPUTED_DEPTH, anchor_from_frame, default_checkpoint_path, find_checkpoint
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.fields.weights import (
+    COMPUTED_DEPTH,
+    anchor_from_frame,
+    default_checkpoint_path,
+    encode_alike,
+    find_checkpoint,
+    load_weights,
+    weights_bytes,
+)
+from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapper import Mapper
 from tests.small import tiny_field, tiny_frames
 
@@ -22,6 +31,7 @@ def test_round_trip_keeps_weights_labels_recipe_and_anchors(tmp_path):
     loaded = load_checkpoint(tmp_path / "w.safetensors")
     for name, tensor in saved.model.state_dict().items():
         assert torch.equal(loaded.model.state_dict()[name], tensor)
+    assert encode_alike(load_weights(tmp_path / "w.safetensors"), saved.weights), "to the shape of every tensor"
     assert loaded.label_set == ROOMS and loaded.model.config == saved.model.config
     assert loaded.train_stamps_ns == {5, 7} and loaded.width == 64
     for a, b in zip(loaded.anchors, anchors, strict=True):
@@ -33,18 +43,39 @@ def test_round_trip_keeps_weights_labels_recipe_and_anchors(tmp_path):
 def test_damaged_files_and_those_of_others_are_refused(tmp_path):
     path, broken = tmp_path / "w.safetensors", tiny_field()
     broken.classifier.weight.data[0, 0] = float("nan")
-    save_checkpoint(Checkpoint(broken), path)
-    with pytest.raises(WeightsError, match="NaN"):
-        load_checkpoint(path)
-    for keep in (100, 0):
-        path.write_bytes(path.read_bytes()[:keep])
-        with pytest.raises(WeightsError, match=r"w\.safetensors"):
-            load_checkpoint(path)
-    save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(WeightsError, match="not weights of this project"):
-        load_checkpoint(path)
-    with pytest.raises(WeightsError, match="no such weights file"):
-        load_checkpoint(tmp_path / "none.safetensors")
+    for load in (Mapper.load, load_checkpoint):
+        save_checkpoint(Checkpoint(broken), path)
+        with pytest.raises(WeightsError, match="NaN"):
+            load(path)
+        for keep in (100, 0):
+            path.write_bytes(path.read_bytes()[:keep])
+            with pytest.raises(WeightsError, match=r"w\.safetensors"):
+                load(path)
+        save_file({"x": torch.zeros(3)}, path)
+        with pytest.raises(WeightsError, match="not weights of this project"):
+            load(path)
+        with pytest.raises(WeightsError, match="no such weights file"):
+            load(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("load", [Mapper.load, load_checkpoint])
+def test_every_tensor_must_be_there_and_fit_and_none_else(tmp_path, load):
+    path, weights = tmp_path / "w.safetensors", Checkpoint(tiny_field()).weights
+    for name, tensor in weights.tensors.items():
+        if name.endswith("num_batches_tracked"):
+            continue
+        rest = {n: t for n, t in weights.tensors.items() if n != name}
+        short = rest | {name: np.zeros(tensor.size + 2, np.float32)}
+        for tensors in (rest, short):
+            path.write_bytes(weights_bytes(dataclasses.replace(weights, tensors=tensors)))
+            with pytest.raises(WeightsError, match=r"w\.safetensors: weights do not fit .*" + re.escape(name)):
+                load(path)
+    for more in ({"extra.weight": np.zeros(3, np.float32)}, {}):
+        label_set = weights.label_set if more else NYU40
+        others = dataclasses.replace(weights, tensors={**weights.tensors, **more}, label_set=label_set)
+        path.write_bytes(weights_bytes(others))
+        with pytest.raises(WeightsError, match=r"w\.safetensors: weights do not fit .*(extra|classifier)\.weight"):
+            load(path)
 
 
 def change_metadata(path, **changes):

@@ -28,8 +28,7 @@ def make_pipeline(max_frames: int = 100, **changes: object) -> MappingPipeline:
         "keyframes": {"source_views": 2, "translation_m": 0.1},
         "history": {"max_frames": max_frames},
     }
-    config = tiny_config(**{**base, **changes})
-    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{**base, **changes})
 
 
 def mapped(frames: list[PosedFrame] | tuple[PosedFrame, ...], **changes: object) -> MappingPipeline:

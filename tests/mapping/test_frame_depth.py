@@ -49,8 +49,7 @@ def without_depth(frames: Sequence[PosedFrame]) -> list[PosedFrame]:
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
-    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
 
 
 def mapped(frames: Sequence[PosedFrame], **changes: object) -> MappingPipeline:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import KITTI360, ROOMS
 from semantic_mapper.mapping.moving import (
@@ -108,8 +107,7 @@ def test_poses_that_are_off_are_put_right_or_known_to_be_wrong(sigma_m: float, s
 
 
 def pipeline(**moving: bool) -> MappingPipeline:
-    config = tiny_config(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
-    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
 
 
 VOXELS = {"voxel_size_m": 0.05, "clear_free_space": False}

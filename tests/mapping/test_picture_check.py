@@ -10,8 +10,6 @@ import pytest
 from research.experiments.picture_faults import BEGIN, FAULTS, named, room_walk, spoil
 from research.scenes import TRAIN_SEEDS
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.checkpoint import streaming
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.picture_check import SENTENCES, PictureCheck
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_pipeline
@@ -57,8 +55,7 @@ def test_a_camera_of_another_lens_is_judged_from_its_first_picture_on() -> None:
 
 
 def test_a_picture_that_would_spoil_the_map_is_refused_and_the_next_one_is_welcome() -> None:
-    config = tiny_config(render={"encode_width": 96, "scale": 0.25})
-    pipeline = MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+    pipeline = tiny_pipeline(render={"encode_width": 96, "scale": 0.25})
     for frame in walk()[:6]:
         pipeline.step(frame)
     before = pipeline.voxel_map.block_count

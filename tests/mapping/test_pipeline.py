@@ -18,17 +18,8 @@ from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
 from semantic_mapper.types import PosedFrame
-from tests.small import tiny_config, tiny_field, tiny_frames
-
-
-def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**changes)
-    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
-
-
-def same_map(a: MappingPipeline, b: MappingPipeline) -> bool:
-    x, y = a.voxel_map.block_state(), b.voxel_map.block_state()
-    return all(np.array_equal(x[k], y[k]) for k in x)
+from tests.mapping.test_voxel_map import same
+from tests.small import tiny_config, tiny_field, tiny_frames, tiny_pipeline
 
 
 @pytest.mark.parametrize("value", [1e-40, 1e4, 1e30, 3.4e38, np.inf, np.nan, -1.0])
@@ -172,7 +163,7 @@ FRAMES = tiny_frames(6)
 
 
 def mapped(count: int = 4) -> MappingPipeline:
-    pipeline = MappingPipeline(tiny_config(keyframes={"translation_m": 0.01}), streaming(tiny_field()), ROOMS)
+    pipeline = tiny_pipeline(keyframes={"translation_m": 0.01})
     for frame in FRAMES[:count]:
         pipeline.step(dataclasses.replace(frame, label=None))
     return pipeline
@@ -184,8 +175,8 @@ def test_an_exchanged_field_goes_on_with_map_and_keyframes_as_they_are(monkeypat
     before, keyframes = pipeline.voxel_map.block_state(), pipeline.keyframes.keyframes
     assert len(keyframes) == 4
     anchors = [FRAMES[4], FRAMES[5]]
-    same = FieldTrial(pipeline, streaming(tiny_field()), (), [FRAMES[0], FRAMES[1]])
-    assert [same.advance() for _ in range(2)] == [False, True]
+    alike = FieldTrial(pipeline, streaming(tiny_field()), (), [FRAMES[0], FRAMES[1]])
+    assert [alike.advance() for _ in range(2)] == [False, True]
     trial = FieldTrial(pipeline, streaming(tiny_field()), anchors, [FRAMES[0], FRAMES[1]])
     assert [trial.advance() for _ in range(4)] == [False, False, False, True]
     # What the map says comes from the same random weights; those that know labels of two views say otherwise.

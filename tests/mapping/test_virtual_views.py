@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -103,8 +102,7 @@ def test_no_block_is_made_where_the_map_has_none():
 
 
 def make_pipeline(**changes: object) -> MappingPipeline:
-    config = tiny_config(**{"keyframes": {"translation_m": 0.02}, **changes})
-    return MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS)
+    return tiny_pipeline(**{"keyframes": {"translation_m": 0.02}, **changes})
 
 
 def half_mapped(**changes: object) -> MappingPipeline:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from semantic_mapper.fields.weights import default_checkpoint_path
+from tests.contract.golden import form, undocumented
 from tests.nodes.support import refused, run, run_process
 
 

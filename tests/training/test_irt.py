@@ -15,6 +15,7 @@ import torch
 
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.device import DeviceField
 from semantic_mapper.fields.render import View, render_image
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.labels import make_label_set
@@ -54,9 +55,10 @@ def accuracy(field: IRT, query: PosedFrame) -> float:
     view = view_from_frame(query, HEIGHTS, 64)
     encoded = field.encode(stack_sources([view]))
     none = np.zeros((48, 64), np.float32)
-    render = render_image(View(field, encoded, CAMERA, query.T_world_camera, none, field.sampling))
+    renderer = DeviceField(field, torch.device("cpu"), field.sampling)
+    render = render_image(View(renderer, encoded, CAMERA, query.T_world_camera, none, field.sampling))
     found = render.logits.argmax(1)
-    return float(((found == view.channel.flatten()) & render.known).float().mean())
+    return float(((found == view.channel.numpy().flatten()) & render.known).mean())
 
 
 def test_two_planes_of_one_texture_are_told_apart_by_height_which_a_picture_cannot() -> None:

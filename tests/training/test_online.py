@@ -132,7 +132,7 @@ def test_good_labels_make_better_weights_whose_encoder_is_the_old_one() -> None:
     assert result.refusal == "" and result.score > result.parent_score + 0.2
     assert steps[-1] == 6
     made = result.checkpoint
-    assert encode_alike(made.model, start.model)
+    assert encode_alike(made.weights, start.weights)
     assert not torch.equal(made.model.state_dict()["classifier.bias"], start.model.state_dict()["classifier.bias"])
     assert made.train_stamps_ns == {77} | {f.stamp_ns for f in FRAMES}  # those that judge are not scored on either
     assert [a.seq for a in made.anchors] == [f.seq for f in pool_of(FRAMES).split().train]
