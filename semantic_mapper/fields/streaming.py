@@ -32,7 +32,7 @@ from semantic_mapper.fields.numbers import (
 from semantic_mapper.fields.sampling import guided_samples
 from semantic_mapper.fields.surface_maps import has_depth, surface_maps
 from semantic_mapper.fields.weights import Tensors
-from semantic_mapper.geometry import camera_matrix, expect_shape, invert_pose
+from semantic_mapper.geometry import camera_matrix, expect_shape
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, Float64
@@ -287,8 +287,10 @@ def _labels(views: StreamedViews, rows: int, columns: int) -> list[NDArray[np.in
 
 
 def _inverse(T_world_camera: Float64) -> Float32:
-    """(1, 3, 4)."""
-    return np.ascontiguousarray(invert_pose(T_world_camera)[None, :3], np.float32)
+    """(1, 3, 4), of the pose in float32, as rays have it: those of this very camera start at its centre."""
+    T = T_world_camera.astype(np.float32)
+    R_camera_world = T[:3, :3].T
+    return np.ascontiguousarray(np.concatenate((R_camera_world, -R_camera_world @ T[:3, 3:]), axis=1)[None])
 
 
 def _aligned(rows: int, columns: int) -> Float32:

@@ -111,7 +111,7 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
         learner.client.return_to_weights(1)
         assert eventually(lambda: learner.client.weights().in_use == 1)
         said = " ".join(run_ok("info", learner.robot.query).stdout.split())
-        assert "weights 1 in use; 2 times taken, 0 refused, 1 rolled back" in said
+        assert "weights 1 in use; accepted: 2, refused: 0, rolled back: 1" in said
         state = learner.client.weights()
         assert (state.in_use, state.before, state.rolled_back) == (1, 0, 1)
         assert [v.state for v in state.versions] == ["earlier", "in use", "rolled back"]
