@@ -98,12 +98,11 @@ def _torch() -> Iterator[Check]:
 
 
 def _weights() -> Iterator[Check]:
-    from semantic_mapper.fields.checkpoint import load_checkpoint
-    from semantic_mapper.fields.weights import default_checkpoint_path
+    from semantic_mapper.fields.weights import default_checkpoint_path, load_weights
 
     path = default_checkpoint_path()
     try:
-        yield Check("weights", "ok", f"{path.name}: {len(load_checkpoint(path).label_set)} classes")
+        yield Check("weights", "ok", f"{path.name}: {len(load_weights(path).label_set)} classes")
     except SemanticMapperError as error:
         yield Check("weights", "bad", str(error), "install the package again, or give --weights to each command")
 

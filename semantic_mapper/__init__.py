@@ -68,6 +68,8 @@ __version__ = "0.1.0"
 # the cores from the kernels, which run on threads of their own; `kernels.binding` fixes it where torch came first.
 SPINNING_THREADS = "torch" in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ
 _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# OpenBLAS reads this once, when numpy is loaded. Its threads spin for 20 ms, and split sums by their number.
+_os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _HOMES = {  # modules below this package, by name; where it is called otherwise there, as MODULE:NAME
     "MapClient": "client",

@@ -67,8 +67,7 @@ def map_(
     """
     must_be_there(*source)
     refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))
-    from semantic_mapper.fields.checkpoint import load_checkpoint
-    from semantic_mapper.fields.weights import COMPUTED_DEPTH
+    from semantic_mapper.fields.weights import COMPUTED_DEPTH, load_weights
     from semantic_mapper.replay.jobs import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
@@ -77,7 +76,7 @@ def map_(
         if len(source) > 1:
             raise typer.BadParameter("of several sources each has to be a part of one log", param_hint="SOURCE")
         if weights is not None:
-            load_checkpoint(weights)  # what is wrong with them is said before the long work
+            load_weights(weights)  # what is wrong with them is said before the long work
         log = out / f"{source[0].resolve().stem}{LOG_SUFFIX}"
         if log.exists() and is_bag(log):
             raise LogError(f"{log}: is a bag, which the log would replace; choose another folder by --out")

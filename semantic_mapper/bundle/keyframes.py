@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
 
 from semantic_mapper.bundle.tracks import Tracks
 from semantic_mapper.geometry import camera_matrix, invert_pose, make_pose, project, transform
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
+
+if TYPE_CHECKING:
+    import gtsam
 
 _LEAST_PARALLAX = np.radians(1.0)  # between the rays that a point is found from
 _MAX_ERROR_PX = 3.0  # a sight that is further off is of something else
@@ -230,6 +231,9 @@ def triangulate(
 def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     """Least squares of all sights and priors (Levenberg-Marquardt, Huber). Deterministic.
     At least one keyframe must be held or have a prior."""
+    import gtsam  # 30 MB, which a mapper without bundle adjustment does not need
+    from gtsam.symbol_shorthand import L, X
+
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     k = problem.intrinsics
     lens = gtsam.Cal3_S2(k.fx, k.fy, 0.0, k.cx, k.cy)
@@ -265,6 +269,8 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
 
 def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int) -> gtsam.Values:
     """Values of the least cost (Levenberg-Marquardt); GTSAM raises RuntimeError where a direction is left open."""
+    import gtsam
+
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())
     cost = optimizer.error()
     for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
