@@ -69,6 +69,7 @@ __version__ = "0.1.0"
 SPINNING_THREADS = "torch" in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ
 _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # OpenBLAS reads this once, when numpy is loaded. Its threads spin for 20 ms, and split sums by their number.
+BLAS_THREADS = "numpy" in _sys.modules and "OPENBLAS_NUM_THREADS" not in _os.environ
 _os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _HOMES = {  # modules below this package, by name; where it is called otherwise there, as MODULE:NAME

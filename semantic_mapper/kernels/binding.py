@@ -21,6 +21,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 import semantic_mapper
 from semantic_mapper.errors import DependencyError, ShapeError
@@ -243,11 +244,14 @@ def _count_of_environment() -> int:
 
 @functools.cache
 def _stop_spinning() -> None:
-    """Make torch's OpenMP threads sleep between operations where torch was loaded before this package.
+    """Make torch's OpenMP threads sleep between operations where torch was loaded before this package; leave OpenBLAS
+    one thread where numpy was.
 
     By default GNU OpenMP lets its threads spin for about 3 ms after each operation, so that a step of the mapper takes
     15 times as long, but next to not at all once it manages more threads than there are cores. One more team of
     threads, which belongs to a thread that sleeps for good, sees to that."""
+    if semantic_mapper.BLAS_THREADS:
+        threadpool_limits(1, "blas")
     if not semantic_mapper.SPINNING_THREADS:
         return
     import torch  # is loaded

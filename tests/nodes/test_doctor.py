@@ -7,7 +7,7 @@ from pathlib import Path
 
 from semantic_mapper.fields.weights import default_checkpoint_path
 from tests.contract.golden import form, undocumented
-from tests.nodes.support import refused, run, run_process
+from tests.nodes.support import run, run_process
 
 
 def test_it_finds_what_the_tests_themselves_need(tmp_path: Path) -> None:
