@@ -99,7 +99,7 @@ def test_kernels_without_torch_use_the_threads_that_it_would_and_do_not_load_it(
     tmp_path: Path, wanted: str, threads: int | None
 ) -> None:
     code = "import sys, kernels; from semantic_mapper.kernels import binding as t; kernels.run()\n"
-    code += "print(t._thread_count(), 'torch' in sys.modules)"
+    code += "print(t.thread_count(), 'torch' in sys.modules)"
     expected = len(os.sched_getaffinity(0)) if threads is None else threads
     assert output(tmp_path, code, OMP_NUM_THREADS=wanted) == [str(expected), "False"]
 
