@@ -8,6 +8,7 @@ from __future__ import annotations
 # OpenVINO leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,7 +65,7 @@ class ImageNetwork:
         model = _Builder(tensors, config).build(size, self.size, with_depth=with_depth)
         threads = {"INFERENCE_NUM_THREADS": thread_count(), "ENABLE_CPU_PINNING": False}
         exact = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
-        self._request = ov.Core().compile_model(model, "CPU", threads | exact).create_infer_request()
+        self._request = _core().compile_model(model, "CPU", threads | exact).create_infer_request()
 
     def encode(self, rgb: UInt8, maps: Float32 | None, depth_m: Float32, spread: Float32, focal: float) -> EncodedImage:
         """Encode an image (H, W, 3).
@@ -80,6 +81,14 @@ def check_networks(tensors: Mapping[str, Array], config: SRayConfig) -> None:
     """Raises KeyError: a tensor is missing; its name. ShapeError: one is of another shape than the config asks for."""
     for with_depth in (False, True)[: 1 + config.encoder.depth]:
         _Builder(tensors, config).build((64, 64), (32, 32), with_depth=with_depth)
+
+
+@cache
+def _core() -> ov.Core:
+    """One for the process: a core gives the thread that first compiles a stack for signals, and takes it back when it
+    is deleted; deleted by another thread, it leaves the first one a stack that is gone, on which the next signal ends
+    the process."""
+    return ov.Core()
 
 
 class _Builder:
