@@ -19,9 +19,9 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.artifacts import clear_results
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, hold_folder, map_path
 from semantic_mapper.replay.sfm.scale import scale_by_floor, scene_depth
 from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary

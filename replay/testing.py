@@ -19,7 +19,7 @@ from semantic_mapper.queries.nearest import NearestSurface, at, nearest
 from semantic_mapper.queries.occupancy import State, occupancy
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.replay.compare import Comparison, Run, Tolerances, compare_runs, read_run
-from semantic_mapper.replay.jobs import replay_log
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.run_folder import MAP_NAME
 from semantic_mapper.replay.summary import SUMMARY_FILE
 

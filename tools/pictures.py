@@ -14,8 +14,8 @@ from semantic_mapper.nodes.process import prepare_process
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import WatchedSession
 from semantic_mapper.replay.artifacts import OVERVIEW_NAME
-from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.log import demo_log
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.rerun_log import recording_server
 from tests.browser import Browser, provide_browser
 

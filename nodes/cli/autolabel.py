@@ -41,7 +41,7 @@ def autolabel(
     """
     must_be_there(*log)
     from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
-    from semantic_mapper.replay.jobs import OFFLINE
+    from semantic_mapper.replay.map_log import OFFLINE
 
     prepare_file(out)
     config = load_mapper_config(None, defaults=OFFLINE)

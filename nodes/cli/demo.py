@@ -54,7 +54,7 @@ def demo(
         refuse_options((given, "--live", "has the settings of its launch file: `up camera` takes others"))
         _run_live(output, out, weights)
         return 0
-    from semantic_mapper.replay.jobs import replay_log
+    from semantic_mapper.replay.map_log import replay_log
 
     began = time.monotonic()
     prepare_folder(out)

@@ -77,7 +77,7 @@ def evaluate(
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {_surface_line(figures)}")
-    from semantic_mapper.replay.jobs import evaluate_log
+    from semantic_mapper.replay.evaluate_log import evaluate_log
 
     settings = mapper.load()
     for log in logs:

@@ -67,7 +67,7 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     from semantic_mapper.replay.finetune_log import FinetuneRequest, finetune_log
-    from semantic_mapper.replay.jobs import OFFLINE
+    from semantic_mapper.replay.map_log import OFFLINE
 
     keep_freed_memory()
     request = FinetuneRequest(

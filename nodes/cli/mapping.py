@@ -68,7 +68,7 @@ def map_(
     must_be_there(*source)
     refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))
     from semantic_mapper.fields.weights import COMPUTED_DEPTH, load_weights
-    from semantic_mapper.replay.jobs import OFFLINE, replay_log
+    from semantic_mapper.replay.map_log import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
     out = out or Path("runs") / source[0].resolve().stem

@@ -42,7 +42,7 @@ def refine(
     path = map_path(source)
     refuse_overwriting(out, path)
     from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED
-    from semantic_mapper.replay.jobs import refine_map
+    from semantic_mapper.replay.refine_map import refine_map
 
     with frame_progress("refine", None, unit="tiles") as bar:
         report, digest = refine_map(path, out, weights, fill=fill, up=up, by_name=by_name, monitor=bar)

@@ -1,7 +1,7 @@
 """``fleet run``: one task for each log, scheduled and tried again by Ray; what is done is in the store alone.
 
 So a run that was stopped or killed goes on with the same command, and nothing has to be repaired before. A task is one
-of the jobs of ``replay.jobs``, with its settings and its findings.
+of the jobs of ``replay``, with its settings and its findings.
 """
 
 from __future__ import annotations
@@ -62,8 +62,10 @@ from semantic_mapper.nodes.fleet.store import (
 from semantic_mapper.plain_text import without_secrets
 from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel_log
 from semantic_mapper.replay.evaluate.report import write_eval_report
+from semantic_mapper.replay.evaluate_log import evaluate_log
 from semantic_mapper.replay.finetune_log import FinetuneRequest, finetune_log
-from semantic_mapper.replay.jobs import OFFLINE, evaluate_log, refine_map, replay_log
+from semantic_mapper.replay.map_log import OFFLINE, replay_log
+from semantic_mapper.replay.refine_map import refine_map
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME
 from semantic_mapper.replay.summary import dig, notes
 from semantic_mapper.training.config import FinetuneConfig

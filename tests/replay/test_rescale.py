@@ -14,9 +14,9 @@ from semantic_mapper.config import load_mapper_config
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.jobs import replay_log
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogReader
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.rescale import rescale_run
 from semantic_mapper.replay.summary import read_summary
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, SCENE_DEPTH_KEY, StreamInfo

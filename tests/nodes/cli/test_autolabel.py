@@ -23,10 +23,10 @@ from semantic_mapper.replay.autolabel_note import AutolabelNote, read_note
 from semantic_mapper.replay.exporters import export_log
 from semantic_mapper.replay.importers.run import import_recording
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.jobs import OFFLINE
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.map_log import OFFLINE
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import Status, StreamInfo

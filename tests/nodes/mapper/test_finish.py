@@ -22,7 +22,7 @@ import os, signal, sys
 from pathlib import Path
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.config import load_mapper_config
-from semantic_mapper.replay.jobs import replay_log
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.nodes.process import StopRequest, prepare_process
 prepare_process()
 load_open3d()

@@ -28,7 +28,7 @@ from semantic_mapper.nodes.viewer import server, sources
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
 from semantic_mapper.queries.snapshot import BlockAges, MapMirror
-from semantic_mapper.replay.jobs import replay_log
+from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.keys import allow, make_keys
