@@ -26,7 +26,7 @@ $(READY): pyproject.toml uv.lock setup.py $(KERNELS) tools/setup.sh tools/system
 	PYTHON=$(PYTHON) tools/setup.sh
 	@touch $@
 
-slim:  ## make .venv with what mapping needs, without CUDA and developers' tools
+slim:  ## make .venv with what mapping needs, without PyTorch and developers' tools
 	PYTHON=$(PYTHON) tools/setup.sh --slim
 
 demo: $(or $(wildcard .venv/.slim),$(READY))  ## map an embedded scene; results in runs/demo
@@ -52,8 +52,7 @@ nightly: $(READY)  ## run all tests, those of research, and everything on a bare
 	$(PYTEST)
 	$(MAKE) test-research
 	tools/bare_machine.sh "make demo && make test"
-	tools/bare_machine.sh --suite trixie "apt-get update -qq && apt-get install -qq --no-install-recommends \
-		python3-torch && make slim && du -sm .venv && make demo && .venv/bin/semantic-mapper doctor"
+	tools/bare_machine.sh "make slim && du -sm .venv && make demo && .venv/bin/semantic-mapper doctor"
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m research.experiments.v4l2_machine

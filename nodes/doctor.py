@@ -58,6 +58,8 @@ def _packages() -> Iterator[Check]:
             if not requirement.specifier.contains(version, prereleases=True):
                 wrong.append(f"{name} {version}, not {requirement.specifier}")
         except metadata.PackageNotFoundError:
+            if name == "torch":  # see _torch
+                continue
             wrong.append(f"{name} is missing")
     found = f"{'; '.join(wrong) or 'all that is needed'}, Python {platform.python_version()} at {sys.executable}"
     yield Check("packages", "bad" if wrong else "ok", found, INSTALL if wrong else "")
@@ -87,6 +89,9 @@ def _torch() -> Iterator[Check]:
     except ImportError as error:
         if is_out_of_memory(error):  # all that follows would fail, too
             raise
+        if isinstance(error, ModuleNotFoundError) and error.name == "torch":
+            yield Check("torch", "note", "not installed; mapping needs none, learning, `refine`, `eval` and GPUs do")
+            return
         yield Check("torch", "bad", str(error), INSTALL)
         return
     yield Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads")

@@ -68,12 +68,14 @@ def run_when_idle() -> None:
 
 
 def failure_message(error: BaseException) -> str:
-    """What a failure that is no error of ours says to people, on one line: out of memory, or an error of the system.
-    Empty where it is a bug, whose traceback is worth more."""
+    """What a failure that is no error of ours says to people, on one line: out of memory, an error of the system, or
+    PyTorch, of which mapping has no need. Empty where it is a bug, whose traceback is worth more."""
     if is_out_of_memory(error):  # native packages raise whatever they like then
         return memory_message(error)
     if isinstance(error, OSError):  # disk full, permission denied: the system's own words and the file
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    if isinstance(error, ModuleNotFoundError) and error.name == "torch":
+        return "this needs PyTorch, which is not installed: pip install torch, or here .tools/bin/uv pip install torch"
     return ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from math import ceil
@@ -42,7 +43,7 @@ OVERVIEW_FRAMES = 2
 MIN_POINTS_A_BLOCK = 2
 OVERVIEW_NAME, REPORT_NAME = "overview.png", "report.html"
 STRIPS = 4  # frames that the report shows
-PACKAGES = ("torch", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
+PACKAGES = ("torch", "openvino", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
 def finish_session(
@@ -303,7 +304,10 @@ def _rounded(value: float | None, digits: int = 2) -> float | None:
 def versions() -> dict[str, str]:
     """Versions of this project, Python and the packages that decide a result."""
     found = {"semantic_mapper": __version__, "python": platform.python_version(), "open3d": open3d_version()}
-    return found | {name: metadata.version(name) for name in PACKAGES}
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):  # torch, of which mapping has no need
+            found[name] = metadata.version(name)
+    return found
 
 
 def _write_report(

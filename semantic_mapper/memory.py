@@ -7,8 +7,8 @@ import ctypes
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)
 _SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate memory", "std::bad_alloc")
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
-# What mapping the demo takes, libraries included: a replay fails with 5.2 GB of address space, and holds 1 GB at most.
-NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 6, 1.5
+# What mapping the demo takes, libraries included: it fails with 1.2 GB of address space, and holds 0.7 GB at most.
+NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 2.5, 1
 _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 
 

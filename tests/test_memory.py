@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -26,8 +27,8 @@ def test_a_lack_of_memory_is_known_by_its_words(error: BaseException, is_shortag
     assert is_out_of_memory(error) == is_shortage
 
 
-def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
-    limited = f"ulimit -v 1500000; exec '{COMMAND}' map {__file__} --out none"
+def test_a_verb_that_may_not_use_enough_memory_says_so(tmp_path: Path) -> None:
+    limited = f"ulimit -v 900000; exec '{COMMAND}' demo --out '{tmp_path}'"
     done = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     line = error_line(done.stderr)

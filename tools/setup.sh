@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
 # Make .venv as uv.lock says, with the Python at hand. Needs Python >= 3.11 with pip; no root, no venv module.
-# --slim: what mapping needs, without CUDA and developers' tools. PyTorch is that of the system's Python (Debian 13:
-# python3-torch), else PyTorch's own build for the CPU.
+# --slim: what mapping needs, without PyTorch, CUDA, Open3D's notebooks and developers' tools.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -28,13 +27,12 @@ if ! mkdir -p "$cache" 2>/dev/null || [[ ! -w $cache ]]; then
   export UV_CACHE_DIR="$PWD/.tools/cache"  # a home that cannot be written to
 fi
 if [[ ${1:-} == --slim ]]; then
-  "$uv" venv --quiet --clear --system-site-packages --python "$python" .venv
+  "$uv" venv --quiet --clear --python "$python" .venv
   "$uv" export --quiet --frozen --no-dev --no-hashes --no-emit-project --extra foxglove --extra realsense \
-    --prune torch --output-file .tools/slim.txt >/dev/null
+    --prune torch --prune ipywidgets --prune nbformat --output-file .tools/slim.txt >/dev/null
   # The wheel of Open3D for x86-64 has CUDA in it; its builds without have a name of their own.
   if [[ $(uname -m) == x86_64 ]]; then sed -i 's/^open3d==/open3d-cpu==/' .tools/slim.txt; fi
   "$uv" pip install --python .venv --no-deps -r .tools/slim.txt -e .
-  .venv/bin/python -c 'import torch' 2>/dev/null || "$uv" pip install --python .venv --torch-backend cpu 'torch>=2.5'
   touch .venv/.slim
 else
   if [[ -e .venv/.slim ]]; then rm -rf .venv; fi
