@@ -124,7 +124,7 @@ def clear_results(out: Path) -> None:
 def _subtitles(session: MapSession, summary: Mapping[str, Any]) -> Iterator[str]:
     """What is to be known of a picture of the map: what is wrong, its score, and where depth comes from."""
     if summary["pose_check"]["warning"]:
-        yield "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json)"
+        yield "POSES CANNOT BE TRUSTED (see summary.json)"
     if summary["map"]["nearly_empty"]:
         yield "MAP NEARLY EMPTY (see summary.json)"
     if summary["depth"]["range_warning"]:
@@ -162,8 +162,8 @@ def _nearly_empty(session: MapSession, points: int) -> str | None:
         "their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
         "(T_world_camera, metres, stamped with the time of capture)"
     )
-    if session.range_warning:
-        why = session.range_warning
+    if warning := session.pipeline.pose_check.warning or session.range_warning:
+        why = warning
     elif 2 * session.without_depth >= mapped:
         why = (
             f"{session.without_depth} of them have no sensor depth, and depth that the field renders does not agree "

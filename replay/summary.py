@@ -111,9 +111,8 @@ def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
 
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
-    frames, warnings = summary["frames"], [dig(summary, place) for place in _WARNINGS]
-    if warnings[0]:  # which says it, too, where depth out of range is why
-        warnings.remove(dig(summary, "depth.range_warning"))
+    frames, (empty, *others) = summary["frames"], [dig(summary, place) or "" for place in _WARNINGS]
+    warnings = [empty, *(text for text in others if text not in empty)]  # it says why
     lines = [f"warning: {warning}" for warning in (*warnings, *(dig(summary, "pictures.notes") or ())) if warning]
     for path, text in _DEPTH_NOTES.items():
         if fraction := dig(summary, path):

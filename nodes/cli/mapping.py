@@ -58,8 +58,8 @@ def map_(
     """Map a recording: a log, a film, or what `import` takes.
 
     Writes report.html, summary.json, map.ply, map.npz and overview.png. What is no log is imported first (options: see
-    `import`). Bad frames are refused with the reason. Ctrl-C writes the map so far. Exit code 3: poses and depth
-    contradict each other, or computed depth ends at its range; 4: the map is empty, or nearly so.
+    `import`). Bad frames are refused with the reason. Ctrl-C writes the map so far. Exit code 3: poses
+    contradict depth or pictures, or computed depth ends at its range; 4: the map is empty, or nearly so.
 
     Example: semantic-mapper map path/to/redkitchen --open
     Example: semantic-mapper map kitchen.mcap --weights kitchen.safetensors

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
-EXIT_UNTRUSTED = 3  # poses and depth contradict each other, or most computed depth is at the end of its range
+EXIT_UNTRUSTED = 3  # poses contradict depth or pictures, or most computed depth is at the end of its range
 EXIT_EMPTY = 4  # a map has no surface, or next to none
 EXIT_INTERRUPTED = 130
 LISTED = 10  # lines of one kind that are shown one by one

@@ -110,6 +110,7 @@ class MappingPipeline:
             self.corrector.make_room()
             views = FrameViews(self._checked(self.corrector.place(frame)))
             self._stage_ms = {}
+            self.pose_check.look(views.frame)
             current = self._timed("encode", self._encode, views)
             if self.domain_check is not None:
                 self.domain_check.note()

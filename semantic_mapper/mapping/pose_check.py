@@ -1,4 +1,4 @@
-"""Whether poses, depth and intrinsics fit each other: overlapping keyframes have to measure the same surface.
+"""Whether poses, depth, intrinsics and pictures fit each other: overlapping keyframes have to measure the same surface.
 
 Each new keyframe's depth is carried into some earlier ones and theirs into it. The disagreement is the lower quartile
 of the relative differences, so that it stays small whatever moves or is hidden: 0.2 to 0.5 % in good recordings, 1 %
@@ -7,7 +7,11 @@ with a stereo camera's noise, 4 to 15 % with inverted poses or camera axes of an
 A pair contradicts itself where one sees through what the other measures: in good recordings in at most 8 % of the
 pixels. Where the poses jump or drift, only the pairs across the jump do: so the oldest of the neighbourhood are
 compared, too, and a tenth of the pairs is enough for a warning. What moves is seen through between neighbours in time
-as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 10 % too long, a drift of 20 cm."""
+as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 10 % too long, a drift of 20 cm.
+
+Poses that stand still give no pairs: there, pictures may not show one view after the other. Two are one view where a
+quarter of the parts with texture correlate: above 0.99 for a still camera, whoever walks before it; in a recording of a
+kitchen 0.3 after a second and a half."""
 
 from __future__ import annotations
 
@@ -16,12 +20,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.keyframes import Keyframe, pose_distances
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
@@ -43,6 +48,15 @@ FAR = 2  # times the range of the map; depth beyond may be noise
 STEP = 3  # every n rows and columns of a keyframe's small depth image
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
+STILL_M, STILL_DEG = 1e-3, 0.1  # that a pose which stands still may change by
+STILL_VIEWS = 6  # different ones at one pose, none of which comes back, contradict it ...
+STILL_FRAMES = 600  # ... among so many frames: a place changes in the end
+SAME_VIEW = 0.5  # correlation from which on parts of two pictures show the same
+_SIZE, _PARTS = (
+    (80, 60),
+    (6, 10, 8, 10),
+)  # of a picture that is compared; its rows of parts, columns, and pixels of each
+_TEXTURED = 6.0  # grey levels that a part with texture varies by
 ALIKE = 0.8  # of the overlap that keyframes have as they are; a cause that leaves less has but moved them apart
 
 
@@ -65,14 +79,17 @@ _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
 
 
 class PoseCheck:
-    """Compares keyframes as they come; changes nothing. ``compared`` of them overlap with earlier ones; ``worst`` and
-    ``worst_contradicting`` are the largest ``recent`` and ``contradicting`` so far. ``warning`` says what is wrong and
-    how to fix it; it stays, as the map keeps what was fused."""
+    """Compares keyframes, and pictures at one pose, as they come; changes nothing. ``compared`` keyframes overlap with
+    earlier ones; ``worst`` and ``worst_contradicting`` are the largest ``recent`` and ``contradicting`` so far.
+    ``warning`` says what is wrong and how to fix it; it stays, as the map keeps what was fused."""
 
     def __init__(self, depth_max_m: float) -> None:
         self._limit_m = FAR * depth_max_m
         self._newest: deque[float] = deque(maxlen=WINDOW)
         self._pairs: deque[float] = deque(maxlen=PAIR_WINDOW)
+        # By camera: a pose at which it stands still, the frame that was the first there, and what it has shown there.
+        self._places: dict[str, tuple[Float64, int, list[Float32]]] = {}
+        self._frames = 0
         self._moving: dict[tuple[str, int], float] = {}  # keyframe -> fraction seen through against the one before it
         self.compared = 0
         self.worst: float | None = None
@@ -91,6 +108,27 @@ class PoseCheck:
         if self.compared < MIN_KEYFRAMES or len(self._pairs) < MIN_PAIRS:
             return None
         return float(np.mean(np.array(self._pairs) > SEEN_THROUGH))
+
+    def look(self, frame: PosedFrame) -> None:
+        """Compare the picture of any frame with those before it whose pose was the same."""
+        if self.warning:
+            return
+        self._frames += 1
+        pose, since, views = self._places.get(frame.camera_id, (frame.T_world_camera, self._frames, []))
+        metres, degrees = pose_distances(pose, frame.T_world_camera)
+        if metres > STILL_M or degrees > STILL_DEG or self._frames - since > STILL_FRAMES:
+            pose, since, views = frame.T_world_camera, self._frames, []
+        new = _view_of(frame.rgb)
+        known = next((n for n, view in enumerate(views) if _is_same_view(view, new)), len(views))
+        # Views after a known one were of something that came between, and has left: the camera has not moved.
+        self._places[frame.camera_id] = pose, since, [*views, new][: known + 1]
+        if known + 1 >= STILL_VIEWS:
+            self.warning = (
+                f"poses stand still while the camera moves: pictures show {STILL_VIEWS} different views at one pose, "
+                f"found at frame seq={frame.seq}: the map cannot be trusted. Check that each frame has a pose of its "
+                "own, and that what gives the poses had not lost track"
+            )
+            _log.warning("poses_stand_still", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
 
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
         """Compare a new keyframe with ``sources``, which see most of what it sees, the best first, and others, oldest
@@ -177,6 +215,24 @@ def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | N
     if compared < max(MIN_PIXELS, MIN_OVERLAP * (of_a + of_b)):
         return None
     return float((np.count_nonzero(there < -BEFORE) + np.count_nonzero(back < -BEFORE)) / compared)
+
+
+def _view_of(rgb: UInt8) -> Float32:
+    """Parts of a picture (H, W, 3), (parts, pixels) float32 grey, without their mean."""
+    small = cv2.resize(rgb, _SIZE, interpolation=cv2.INTER_AREA)
+    gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.float32)
+    parts = gray.reshape(_PARTS).swapaxes(1, 2).reshape(_PARTS[0] * _PARTS[2], -1)
+    return parts - parts.mean(axis=1, keepdims=True)
+
+
+def _is_same_view(a: Float32, b: Float32) -> bool:
+    """Whether a quarter of the parts with texture correlate; True where there are too few of them to tell."""
+    spread = np.sqrt((a * a).mean(axis=1)), np.sqrt((b * b).mean(axis=1))
+    textured = np.maximum(*spread) > _TEXTURED
+    if textured.sum() < len(a) / 4:
+        return True
+    correlation = (a * b).mean(axis=1)[textured] / np.maximum(spread[0] * spread[1], 1e-6)[textured]
+    return float(np.percentile(correlation, 75)) > SAME_VIEW
 
 
 def _oldest_neighbours(new: Keyframe, keyframes: Sequence[Keyframe], but: Sequence[Keyframe]) -> list[Keyframe]:

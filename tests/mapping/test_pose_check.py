@@ -136,9 +136,38 @@ def test_what_moves_in_a_third_of_the_picture_raises_no_warning() -> None:
     assert poses.compared > MIN_KEYFRAMES and not poses.warning
 
 
-def test_the_pipeline_checks_its_keyframes_and_the_map_stays_the_same() -> None:
+def at_one_pose(frame: PosedFrame) -> PosedFrame:
+    return replace(frame, T_world_camera=np.eye(4))
+
+
+def test_poses_that_stand_still_while_pictures_do_not_are_reported_once_without_depth_too() -> None:
+    poses = PoseCheck(5.0)
+    with capture_logs() as logs:
+        for frame in room():
+            poses.look(replace(at_one_pose(frame), depth_m=None))
+    assert "poses stand still" in poses.warning
+    assert [entry["event"] for entry in logs] == ["poses_stand_still"]
+
+
+@pytest.mark.parametrize("passes", ["nothing", "somebody near", "a light"])
+def test_a_camera_that_stands_still_raises_no_warning(passes: str) -> None:
+    rng, poses, (still, *others) = np.random.default_rng(0), PoseCheck(5.0), room()
+    width = still.intrinsics.width
+    for number in range(120):
+        rgb = still.rgb.astype(np.float64)
+        if passes == "somebody near" and number % 10:  # in two thirds of the picture, another one each time
+            rgb[:, width // 3 :] = others[number % len(others)].rgb[:, width // 3 :]
+        if passes == "a light":
+            rgb *= 1 - 0.5 * (number // 7 % 2)
+        noisy = np.clip(rgb + rng.normal(0, 5, rgb.shape), 0, 255).astype(np.uint8)
+        poses.look(replace(at_one_pose(still), rgb=noisy))
+    assert not poses.warning
+
+
+def test_the_pipeline_checks_poses_and_the_map_stays_the_same() -> None:
     checked, unchecked = tiny_pipeline(), tiny_pipeline()
     unchecked.pose_check.add = lambda *_: None  # type: ignore[method-assign]
+    unchecked.pose_check.look = lambda *_: None  # type: ignore[method-assign]
     for frame in room():
         wrong = replace(frame, T_world_camera=invert_pose(frame.T_world_camera))
         checked.step(wrong)

@@ -73,6 +73,13 @@ def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights:
     assert (out / "map.ply").exists()
 
 
+def test_poses_that_never_move_make_a_map_that_cannot_be_trusted(tmp_path: Path, weights: Path, config: Path) -> None:
+    frames = [replace(f, T_world_camera=np.eye(4)) for f in tiny_frames(30)]
+    log = write_log(tmp_path / "log.mcap", frames)
+    done = run("map", log, "--out", tmp_path / "run", "--weights", weights, "--config", config)
+    assert done.returncode == 3 and "warning: poses stand still" in done.stdout
+
+
 @pytest.mark.slow
 def test_a_map_that_cannot_be_trusted_has_an_exit_code_of_its_own(tmp_path: Path) -> None:
     """Poses of a body with x forward, published as the camera's."""
