@@ -28,7 +28,7 @@ from semantic_mapper.nodes.viewer.server import ViewerPage
 from semantic_mapper.replay.importers.base import ImportOptions
 from semantic_mapper.replay.importers.ros_bags import is_bag
 from semantic_mapper.replay.importers.run import needs_import
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, hold_folder
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, free_name, hold_folder, is_map
 from semantic_mapper.replay.summary import dig, ending
 
 
@@ -46,7 +46,7 @@ def map_(
     mapper: MapperSettings,
     options: HiddenSourceOptions,
     *,
-    out: Path | None = None,  # folder for the results [runs/NAME]
+    out: Path | None = None,  # folder for the results [runs/NAME, or a new NAME-1, ...]
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
     rerun: Path | None = None,  # also a Rerun recording (.rrd)
@@ -71,7 +71,11 @@ def map_(
     from semantic_mapper.replay.map_log import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
-    out = out or Path("runs") / source[0].resolve().stem
+    usual = Path("runs") / source[0].resolve().stem
+    if out is None and (out := free_name(usual) if is_map(usual) else usual) != usual:
+        stderr_console().print(
+            f"{usual} holds a map: this one goes to {out}; --out {usual} replaces it", style="yellow"
+        )
     if needs_import(source[0]):
         if len(source) > 1:
             raise typer.BadParameter("of several sources each has to be a part of one log", param_hint="SOURCE")

@@ -139,6 +139,18 @@ def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path
     assert not any(out.iterdir())
 
 
+def test_without_out_no_map_is_replaced(
+    log: Path, weights: Path, config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = tmp_path / "runs" / log.stem / "map.npz"
+    before.parent.mkdir(parents=True)
+    before.touch()
+    done = run_ok("map", log, "--weights", weights, "--config", config, "--max-frames", "2")
+    assert f"runs/{log.stem} holds a map" in done.stderr and f"runs/{log.stem}-1/map.npz" in done.stdout
+    assert not before.stat().st_size and [p.name for p in before.parent.iterdir()] == ["map.npz"]
+
+
 def test_a_refused_run_leaves_no_folder_and_a_stopped_one_what_it_has_written(tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no log")
     (tmp_path / "pictures").mkdir()
