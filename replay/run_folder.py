@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import remove_stale
 from semantic_mapper.log_events import get_logger
@@ -87,7 +88,7 @@ def map_path(path: Path) -> Path:
     """The file of a map that is named itself, or by its folder. Raises ConfigError: no map is there, or it is a log;
     with what to do, from what is there."""
     if not path.exists():
-        raise ConfigError(f"{path}: no such map file or folder")
+        raise ConfigError(f"{path}: no such map file or folder{nearest_path(path)}")
     if path.is_dir() and (path / MAP_NAME).is_file():
         return path / MAP_NAME
     if is_log(path):

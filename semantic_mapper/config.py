@@ -9,6 +9,7 @@ import difflib
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -537,7 +538,7 @@ def _read(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     try:
         return read_regular(path, limit)
     except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file") from error
+        raise ConfigError(f"{path}: no such file{nearest_path(path)}") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
 
@@ -585,6 +586,16 @@ def nearest(wrong: str, valid: Sequence[str]) -> str:
     """How a message about a wrong name ends: with the valid one that is nearest, else with all."""
     near = difflib.get_close_matches(wrong, valid, n=1, cutoff=0.5)
     return f"; did you mean `{near[0]}`?" if near else f"; there are {', '.join(valid) or 'none'}"
+
+
+def nearest_path(path: Path) -> str:
+    """How a message about a file or folder that is missing ends: with the one whose name is nearest; empty where none
+    is."""
+    with suppress(OSError, ValueError):  # a folder that cannot be listed; nothing is missing
+        *_, wrong = (part for part in (path, *path.parents) if not part.exists())
+        near = difflib.get_close_matches(wrong.name, sorted(p.name for p in wrong.parent.iterdir()), n=1)
+        return f"; did you mean `{wrong.with_name(near[0]) / path.relative_to(wrong)}`?" if near else ""
+    return ""
 
 
 def _types_at(path: str, kind: type[msgspec.Struct]) -> list[inspect.Type]:

@@ -31,6 +31,7 @@ from semantic_mapper.config import (
     assign,
     convert_config,
     load_mapper_config,
+    nearest_path,
     parse_assignments,
     read_toml,
 )
@@ -333,7 +334,8 @@ def must_be_there(*paths: Path) -> None:
     LogError: one of them is."""
     for path in paths:
         if not path.is_file() and not path.is_dir():
-            what = "it is no regular file; copy its content to one" if path.exists() else "no such file or folder"
+            missing = f"no such file or folder{nearest_path(path)}"
+            what = "it is no regular file; copy its content to one" if path.exists() else missing
             raise LogError(f"{path}: cannot be read: {what}")
 
 

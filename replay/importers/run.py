@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, read_note
@@ -24,6 +25,7 @@ from semantic_mapper.replay.log.format import LogReader, atomic_log
 from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, is_log
 from semantic_mapper.replay.sfm.colmap import find_models
+from semantic_mapper.replay.sfm.film import PICTURE_SUFFIXES
 from semantic_mapper.transport.images import CodecOptions
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {  # layouts.toml shows the files of each
@@ -60,7 +62,7 @@ MARKS = {
 
 SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 _SHOWN = "; docs/layouts.md shows the files of each format"
-LISTED = 5  # recordings that an error names
+LISTED = 5  # recordings, or folders of pictures, that an error names
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
@@ -91,7 +93,7 @@ def detect_format(src: Path) -> str:
     Raises ImportSourceError: no such file or folder, or none of the formats.
     """
     if not src.exists():
-        raise ImportSourceError(f"{src}: no such file or folder")
+        raise ImportSourceError(f"{src}: no such file or folder{nearest_path(src)}")
     if is_bag(src):
         return "rosbag"
     if src.is_file():
@@ -122,8 +124,23 @@ def is_recording(src: Path) -> bool:
         detect_format(src)
     except ImportSourceError:
         nearly = any((src / name).exists() for name in _FOLDERS if name != "database.db")  # pictures, still
-        return nearly or any(_by_marks(folder) is not None for folder in src.iterdir() if folder.is_dir())
+        return nearly or bool(_recordings_in(src))
     return True
+
+
+def _find_recording(src: Path) -> tuple[Path, str]:
+    """A recording, or the only one in a folder, and its format. Raises ImportSourceError: see ``detect_format``."""
+    try:
+        return src, detect_format(src)
+    except ImportSourceError:
+        inside = _recordings_in(src) if src.is_dir() and not any((src / name).exists() for name in _FOLDERS) else []
+        if len(inside) != 1:
+            raise
+        return inside[0], detect_format(inside[0])
+
+
+def _recordings_in(folder: Path) -> list[Path]:
+    return [p for p in sorted(folder.iterdir()) if is_bag(p) or (p.is_dir() and _by_marks(p) is not None)]
 
 
 def _by_marks(src: Path) -> str | None:
@@ -140,13 +157,19 @@ def _what_folder(src: Path) -> str:
     advice = next((_FOLDERS[name] for name in _FOLDERS if (src / name).exists()), None)
     if advice is not None:
         return advice
-    below = [p for p in sorted(src.iterdir()) if is_bag(p) or (p.is_dir() and _by_marks(p) is not None)]
-    if below:
-        return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
+    if below := _recordings_in(src) or [p for folder in sorted(src.glob("*/")) for p in _recordings_in(folder)]:
+        return _name_one("recordings", below)
     name = min(MARKS, key=lambda n: len(_lacks(src, n)))
     if len(_lacks(src, name)) < len(MARKS[name]):
         return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}{_SHOWN}"
+    files = [*src.glob("*/*"), *src.glob("*/*/*")]
+    if films := sorted({file.parent for file in files if file.suffix.lower() in PICTURE_SUFFIXES}):
+        return _name_one("folders of pictures", films)
     return f"is no recording of a known format ({', '.join(FORMATS)}){_SHOWN}"
+
+
+def _name_one(what: str, places: Sequence[Path]) -> str:
+    return f"holds {what}; name one of them: {', '.join(map(str, places[:LISTED]))} (`semantic-mapper map {places[0]}`)"
 
 
 def _what_file(src: Path) -> str:
@@ -192,7 +215,8 @@ def import_recording(
     """
     if dst.exists() and not overwrite:
         raise LogError(f"{dst}: exists already; choose another name, or --overwrite it")
-    name = format_name or detect_format(src)
+    given = src
+    src, name = (src, format_name) if format_name else _find_recording(src)
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
     if options.scale is not None and name not in SCALED:
@@ -201,6 +225,8 @@ def import_recording(
         raise ImportSourceError(f"{src}: no such folder")
     recording = FORMATS[name](src, options)
     numbers = range(0, len(recording), options.every)[: options.max_frames]
+    if src != given:
+        recording.notices.insert(0, f"the recording is {src}, the only one in {given}")
     report = ImportReport(name, recording.depth_scale, recording.info, notices=recording.notices)
     pseudo_labelled = computed = 0
     packing = CodecOptions(depth_scale=recording.depth_scale.units_per_m)

@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
+from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import CodecError, ConfigError, EmptyMapError, LogError
 from semantic_mapper.files import open_regular
 from semantic_mapper.replay.log.mcap_scan import Place, Scan, read_attachment, read_payloads, scan
@@ -173,7 +174,7 @@ class LogReader:
         except ConfigError as error:
             raise LogError(f"{path}: cannot be read: it is no regular file; copy its content to one") from error
         except OSError as error:
-            raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+            raise LogError(f"{path}: cannot be read: {error.strerror or error}{nearest_path(path)}") from error
         kept: dict[str, LogAttachment] = {}
         for place in found.attachments:
             attachment = read_attachment(fd, place)

@@ -156,14 +156,17 @@ def test_every_second_frame_is_imported(folder: Path) -> None:
 
 
 def test_formats_are_told_apart(folder: Path, tmp_path: Path) -> None:
-    for name in ("nothing", "half/color", "bag", "nice"):
+    for name in ("nothing", "half/color", "bag", "nice", "above/film/left"):
         (tmp_path / name).mkdir(parents=True)
-    bag = ("bag/metadata.yaml", "bag/day_0.db3", "day.bag")
-    for name in (*bag, "half/poses.txt", "film.MP4", "day.zip", "a.sens", "nice/traj.txt", "log.mcap"):
+    files = ("half/poses.txt", "film.MP4", "day.zip", "a.sens", "nice/traj.txt", "log.mcap", "above/film/left/1.jpg")
+    for name in ("bag/metadata.yaml", "bag/day_0.db3", "day.bag", *files):
         (tmp_path / name).touch()
     for src, complaint in (
         ("nothing", "no recording of a known format"),
-        (".", "holds recordings; name one of them: .*bag, .*day.bag, .*kitchen"),
+        (".", r"holds recordings; name one of them: .*bag, .*day.bag, .*kitchen \(`semantic-mapper map .*bag`\)"),
+        ("above", r"holds folders of pictures; name one of them: .*left \(`semantic-mapper map .*above/film/left`\)"),
+        ("nothink", r"no such file or folder; did you mean `.*/nothing`\?"),
+        ("hapf/color", r"no such file or folder; did you mean `.*/half/color`\?"),
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json; docs/layouts.md shows"),
         ("film.MP4", "is a film, which has no poses"),
         ("day.zip", "is packed; unpack it"),
@@ -175,6 +178,9 @@ def test_formats_are_told_apart(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(ImportSourceError, match=complaint):
             detect_format(tmp_path / src)
     assert [detect_format(tmp_path / src) for src in ("bag", "day.bag")] == ["rosbag", "rosbag"]
+    shutil.move(tmp_path / "bag", tmp_path / "above" / "film" / "bag")
+    with pytest.raises(ImportSourceError, match=r"holds recordings; name one of them: .*above/film/bag"):
+        detect_format(tmp_path / "above")
     with pytest.raises(ImportSourceError, match="no format 'film'"):
         import_recording(folder, tmp_path / "x.mcap", "film")
 
@@ -356,7 +362,8 @@ def test_a_sequence_of_7_scenes_gets_poses_and_depth_of_its_colour_camera(tmp_pa
         rec.write_image(src / f"frame-{number:06d}.color.png", np.full((480, 640, 3), number, np.uint8))
         rec.write_image(src / f"frame-{number:06d}.depth.png", depth)
         np.savetxt(src / f"frame-{number:06d}.pose.txt", rec.pose(number))
-    report, frames = imported(src)
+    report, frames = imported(src.parent)
+    assert f"the recording is {src}, the only one" in report.notices[0]
     assert (report.format, report.frames, [frame.stamp_ns for frame in frames]) == ("7-scenes", 2, [0, 100_000_000])
     for frame in frames:
         np.testing.assert_allclose(frame.T_world_camera, rec.pose(frame.seq) @ np.linalg.inv(T_COLOR_DEPTH), atol=1e-12)
