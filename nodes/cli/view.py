@@ -38,8 +38,8 @@ def view(
 
     Images, rendered semantics, depth, the camera's path, the map and stage times are shown. The map has a tab for each
     colouring: class, camera colour, confidence, and age: how long ago its surroundings last changed (a saved map has
-    none). Of a log: `map --view`. The page is served on this machine alone, and sends no data out (the viewer asks for
-    a font on the web); to see it from another one, tunnel both ports.
+    none). Of a log: `map --view`. The page is served on this machine alone, and asks no other; to see it from another
+    one, tunnel both ports.
 
     With --status, twice a second: states, restarts, memory, rates, ages and losses of each node. frame: time since the
     last one; age: of the last one when it was mapped; beat: since the last sign of life. A launch on another machine is

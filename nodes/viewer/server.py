@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import http.client
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -45,6 +46,7 @@ STOP_S = 3.0
 TIMEOUT_S = 10.0  # of one request
 _POLL_S = 0.05
 _KEPT = ("Content-Type", "Content-Length", "rerun-final-length")  # headers that are passed on
+_OUTSIDE = re.compile(rb"<link\b[^>]*\bhref=[\"']?https?:[^>]*>")  # links of a page to other machines
 
 _log = structlog.get_logger(__name__)
 
@@ -192,9 +194,9 @@ def _answers(port: int) -> bool:
 def quiet_page(port: int, source: int, allowed: str) -> LocalServer:
     """Serve the pages of another server of this machine with the order to speak to nobody else.
 
-    Rerun's viewer reports its use, looks for newer releases and loads a font, whatever its settings. A content security
-    policy is what a browser obeys. ``source`` is the port of the other server, ``allowed`` an origin that the page may
-    fetch from, too.
+    Rerun's viewer reports its use and looks for newer releases, whatever its settings. A content security policy is
+    what a browser obeys, but no policy stops it from connecting ahead of the font that the page links to: such links
+    are blanked. ``source`` is the port of the other server, ``allowed`` an origin that the page may fetch from, too.
     """
     policy = (
         "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; "
@@ -221,6 +223,8 @@ def quiet_page(port: int, source: int, allowed: str) -> LocalServer:
                     for name, value in (kept | headers).items():
                         self.send_header(name, value)
                     self.end_headers()
+                    if kept.get("Content-Type", "").startswith("text/html"):  # blanks keep the length that was said
+                        self.wfile.write(_OUTSIDE.sub(lambda link: b" " * len(link[0]), answer.read()))
                     shutil.copyfileobj(answer, self.wfile)
                 except (OSError, http.client.HTTPException) as error:  # the browser has left, or the server has ended
                     _log.debug("page_not_served", path=self.path, reason=str(error))

@@ -60,7 +60,9 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
         connection = http.client.HTTPConnection(page.hostname or "", page.port, timeout=10)
         connection.request("GET", f"/?{page.query}")
         answer = connection.getresponse()
-        assert answer.status == 200 and b"re_viewer.js" in answer.read()
+        shown = answer.read()
+        assert answer.status == 200 and b"re_viewer.js" in shown and b'<link rel="icon"' in shown
+        assert len(shown) == int(answer.headers["Content-Length"]) and b"fonts.g" not in shown
         rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
         assert rules["connect-src"].split() == ["'self'", "data:", "blob:", f"http://127.0.0.1:{data.port}"]
         assert "http" not in rules["default-src"]
