@@ -98,7 +98,9 @@ def finish_session(
         subtitle="; ".join(_subtitles(session, summary)),
         up=up,
         unit=unit,
-        rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
+        rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline, room.center) for room in graph.rooms]
+        if graph
+        else (),
     )
     write_picture(out / OVERVIEW_NAME, overview)
     if session.rerun is not None:

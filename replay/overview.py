@@ -59,12 +59,13 @@ def draw_overview(
     subtitle: str = "",
     up: Float64 | None = None,
     unit: str = "m",
-    rooms: Sequence[tuple[str, Float64]] = (),
+    rooms: Sequence[tuple[str, Float64, Float64]] = (),
 ) -> Figure:
     """Draw a row of tiles for each strip, best one to three, under them the map and the legend, 1600 pixels wide.
 
     ``up`` (3,) is a rough up of the world, as of ``upright.camera_up``; None estimates it from the points alone.
-    ``unit`` is that of lengths. ``rooms``, each a name and an outline (N, 3) in the world, are drawn from above.
+    ``unit`` is that of lengths. ``rooms``, each a name, an outline (N, 3) and where the name stands (3,) in the world,
+    are drawn from above.
     """
     top = HEADER + sum(_strip_height(strip) + GAP for strip in strips)
     figure = plots.new_figure(WIDTH, top + CAPTION + MAP_HEIGHT + MARGIN)
@@ -142,7 +143,7 @@ def _put_map(
     label_set: LabelSet,
     up: Float64 | None,
     unit: str,
-    rooms: Sequence[tuple[str, Float64]],
+    rooms: Sequence[tuple[str, Float64, Float64]],
 ) -> None:
     width = (WIDTH - 2 * MARGIN - 2 * GAP - LEGEND_WIDTH) // 2
     size = (width, MAP_HEIGHT)
@@ -162,11 +163,12 @@ def _put_map(
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, plots.PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
-    axes = plots.put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
+    outlined = "; outline: rooms, with what furniture covers" if rooms else ""
+    axes = plots.put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}{outlined}")
     put_scale_bar(axes, scale, unit)
-    for name, outline in rooms:
-        corners = (from_above(outline @ R_plan_world.T)[:, :2] - camera[0]) * scale + np.array(size) / 2
-        _put_room(axes, name, corners)
+    for name, outline, middle in rooms:
+        drawn = from_above(np.vstack((outline, middle)) @ R_plan_world.T)[:, :2]
+        _put_room(axes, name, (drawn - camera[0]) * scale + np.array(size) / 2)
     plots.put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
@@ -199,14 +201,14 @@ def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDA
     return inside if inside.any() else ~inside
 
 
-def _put_room(axes: Axes, name: str, corners: Float64) -> None:
-    """The outline (N, 2) of a room, in pixels, and its name in the corner that is uppermost."""
-    x, y = np.concatenate((corners, corners[:1])).T
+def _put_room(axes: Axes, name: str, drawn: Float64) -> None:
+    """The outline of a room and where its name stands, (N + 1, 2) pixels."""
+    x, y = np.concatenate((drawn[:-1], drawn[:1])).T
     axes.plot(x, y, color="black", linewidth=3, clip_on=True)
     axes.plot(x, y, color="white", linewidth=1.2, clip_on=True)
-    at = corners[int((corners @ (0.3, 1.0)).argmin())] + (6, 12)
     behind = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 1.5}
-    plots.put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
+    at = (float(drawn[-1, 0]), float(drawn[-1, 1]))
+    plots.put_text(axes, at, name, bbox=behind, clip_on=True, ha="center", va="center")
 
 
 def put_scale_bar(axes: Axes, scale: float, unit: str) -> None:

@@ -103,7 +103,6 @@ def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> di
     chosen = np.random.default_rng(0).permutation(len(points.xyz))[:count]
     xyz = points.xyz[chosen].astype(np.float64) @ upright_rotation(points.xyz, up).T
     low, extent = xyz.min(axis=0), np.maximum(np.ptp(xyz, axis=0), 1e-3)
-    middle = np.percentile(xyz, (1, 99), axis=0)  # few stray points are no part of the first look
     table = np.full((256, 4), (*UNKNOWN, 255), np.uint8)
     table[list(label_set.ids), :3] = label_set.colors
     ids = dict(zip(label_set.names, label_set.ids, strict=True)) | {"unknown": label_set.ignore_id}
@@ -115,8 +114,6 @@ def point_view(points: MapPoints, label_set: LabelSet, up: Float64 | None) -> di
         "count": count,
         "low": low.tolist(),
         "extent": extent.tolist(),
-        "centre": middle.mean(axis=0).tolist(),
-        "size": max(float(np.linalg.norm(np.ptp(middle, axis=0))), 0.1),
         "spacing": point_spacing(xyz),
         "ceiling": ceiling_height(xyz),
         "azimuth": open_side(xyz),

@@ -23,7 +23,7 @@ from semantic_mapper.plots import (
     put_text,
     rendered,
 )
-from semantic_mapper.replay.overview import open_side
+from semantic_mapper.replay.overview import from_angle, open_side
 from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
-DISTANCE = 0.95  # of the eye, times the map's diagonal
+FOCAL = 1.06 / np.tan(np.deg2rad(55) / 2)  # Rerun's, with a margin; in halves of a view's height, its least width
 _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
@@ -51,14 +51,16 @@ def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
     """An eye on a map, points (N, 3), N > 0, from above, on its most open side. ``up`` (3,) is a first guess of which
     way is up; None = unknown."""
     R_upright_world = upright_rotation(xyz, up)
-    upright = xyz.astype(np.float64) @ R_upright_world.T
-    low, high = np.percentile(upright, (1, 99), axis=0)
-    target, size = (low + high) / 2, np.maximum(high - low, 0.3)
+    upright = xyz[~in_ceiling(xyz, R_upright_world[2])].astype(np.float64) @ R_upright_world.T
     azimuth = open_side(upright)
-    level = np.cos(ELEVATION)
-    direction = np.array((np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(ELEVATION)))
-    position = target + DISTANCE * float(np.linalg.norm(size)) * direction
-    return Eye(position @ R_upright_world, target @ R_upright_world, R_upright_world[2])
+    R_view_world = from_angle(np.eye(3), azimuth, ELEVATION).T @ R_upright_world  # right, down, away from the viewer
+    x, y, z = from_angle(upright, azimuth, ELEVATION).T
+    # The edges of the view are planes through the eye: of each, the point that is farthest out, but for stray ones.
+    a, b, c, d = (float(np.percentile(side - z / FOCAL, 99.8)) for side in (x, -x, y, -y))
+    across, away = np.array(((a - b) / 2, (c - d) / 2)), FOCAL * max(a + b, c + d) / 2
+    middle = float(np.median(z))
+    position, target = (np.append(across, depth) for depth in (min(-away, middle - 0.3), middle))
+    return Eye(position @ R_view_world, target @ R_view_world, R_upright_world[2])
 
 
 def in_ceiling(xyz: Float32, up: Float64) -> Bool:

@@ -80,7 +80,8 @@
   }
   const cloud = gl.createVertexArray(), corners = gl.createVertexArray();
   gl.bindVertexArray(cloud);
-  attribute(points, "place", new Uint16Array(bytes(data.xyz).buffer), 3, gl.UNSIGNED_SHORT, true);
+  const places = new Uint16Array(bytes(data.xyz).buffer);
+  attribute(points, "place", places, 3, gl.UNSIGNED_SHORT, true);
   attribute(points, "rgb", bytes(data.rgb), 3, gl.UNSIGNED_BYTE, true);
   attribute(points, "label", bytes(data.label), 1, gl.UNSIGNED_BYTE, false);
   gl.bindVertexArray(corners);
@@ -90,15 +91,29 @@
 
   // The camera: turned about `centre`, with z up; metres and radians.
   const high = data.low.map((v, i) => v + data.extent[i]);
-  const size = data.size, reach = Math.hypot(...data.extent), FIELD_OF_VIEW = 0.8;
+  const reach = Math.hypot(...data.extent), FIELD_OF_VIEW = 0.8, focal = 1 / Math.tan(FIELD_OF_VIEW / 2);
   let centre, azimuth, elevation, distance;
-  const goBack = () => { [centre, azimuth, elevation, distance] = [[...data.centre], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.15 : 1.0) * size]; };
-  goBack();
   const axes = () => {
     const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
     return [[-sa, ca, 0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]];  // right, up, towards the viewer
   };
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  // Of the width and of the height of the picture, the smaller one has the field of view.
+  const focals = () => { const w = canvas.clientWidth || 1, h = canvas.clientHeight || 1, side = Math.min(w, h); return [focal * side / w, focal * side / h]; };
+  function goBack() {  // the nearest place from which all that is not cut away is seen, but for a few stray points
+    [azimuth, elevation] = [data.azimuth, 0.85];
+    const seen = [], way = axes(), [fx, fy] = focals().map((f) => 1.08 * f), cut = data.ceiling ?? Infinity;
+    for (let k = 0; k < data.count; k += Math.ceil(data.count / 20000)) {
+      const at = data.low.map((v, i) => v + data.extent[i] * places[3 * k + i] / 65535);
+      if (at[2] <= cut) seen.push(way.map((axis) => dot(axis, at)));
+    }
+    const ranked = (value, part) => seen.map(value).sort((p, q) => p - q)[Math.floor(part * (seen.length - 1))];
+    // The edges of the picture are planes through the eye: the point that is farthest out puts each in its place.
+    const [a, b, c, d] = [[fx, 0], [-fx, 0], [0, fy], [0, -fy]].map(([p, q]) => ranked(([x, y, z]) => p * x + q * y + z, 0.999));
+    const middle = [(a - b) / (2 * fx), (c - d) / (2 * fy), ranked((at) => at[2], 0.5)];
+    distance = Math.max((a + b) / 2 - middle[2], (c + d) / 2 - middle[2], 0.1);
+    centre = [0, 1, 2].map((i) => way[0][i] * middle[0] + way[1][i] * middle[1] + way[2][i] * middle[2]);
+  }
 
   function draw() {
     waiting = false;
@@ -116,10 +131,9 @@
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, depths, 0);
     }
     const near = Math.max(0.02, distance - reach), far = distance + 2 * reach;
-    const focal = 1 / Math.tan(FIELD_OF_VIEW / 2), narrow = Math.min(1, width / height), [right, up, back] = axes();
+    const [right, up, back] = axes();
     const eye = centre.map((v, i) => v + distance * back[i]);
-    const [fx, fy, a] = [focal * narrow * height / width, focal * narrow, (far + near) / (near - far)];
-    const b = 2 * far * near / (near - far);
+    const [fx, fy] = focals(), a = (far + near) / (near - far), b = 2 * far * near / (near - far);
     const view = [0, 1, 2].flatMap((i) => [fx * right[i], fy * up[i], a * back[i], -back[i]]);
     view.push(-fx * dot(right, eye), -fy * dot(up, eye), -a * dot(back, eye) + b, dot(back, eye));
 
@@ -190,7 +204,7 @@
 
   const pointers = new Map();
   const gap = () => { const [p, q] = [...pointers.values()]; return Math.hypot(p.x - q.x, p.y - q.y); };
-  const zoom = (factor) => { distance = Math.min(Math.max(distance * factor, 0.02 * size), 6 * size); };
+  const zoom = (factor) => { distance = Math.min(Math.max(distance * factor, 0.02 * reach), 6 * reach); };
   function move(x, y) {
     const metres = 2 * distance * Math.tan(FIELD_OF_VIEW / 2) / Math.min(canvas.clientHeight, canvas.clientWidth);
     const [right, up] = axes();
@@ -225,6 +239,7 @@
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("dblclick", () => { goBack(); redraw(); });
   new ResizeObserver(redraw).observe(canvas);
+  goBack();
   slide();
   choose();
 })();

@@ -71,7 +71,9 @@ def test_rooms_are_drawn_where_they_are_as_a_floor_plan_lies() -> None:
     points = room_points()
     turned = replace(points, xyz=points.xyz @ turn_about_up(np.deg2rad(30)).T.astype(np.float32))
     outline = np.array(((0, 0, 0), (4, 0, 0), (4, 3, 0), (0, 3, 0))) @ turn_about_up(np.deg2rad(30)).T
-    figure = figure_of(draw_overview, [], turned, ROOMS, title="room", up=UP, rooms=[("room 7: 12 m²", outline)])
+    figure = figure_of(
+        draw_overview, [], turned, ROOMS, title="room", up=UP, rooms=[("room 7: 12 m²", outline, outline.mean(0))]
+    )
     assert "room 7: 12 m²" in {t.get_text() for t in figure.findobj(Text)} and not misplaced_texts(figure)
     x, y = next(line for line in figure.findobj(Line2D) if len(line.get_xdata()) == 5).get_data()
     sides = np.diff(np.stack((x, -y), axis=1).astype(float), axis=0)
