@@ -144,6 +144,9 @@ class MapperOptions(Config, frozen=True):
         return (self.input,) if isinstance(self.input, str) else self.input
 
 
+Recorded = Literal["info", "frame", "refused", "status", "map"]
+
+
 class RecorderOptions(Config, frozen=True):
     """Writes what other nodes publish to a log; loses nothing but what the disk has no room for."""
 
@@ -151,7 +154,7 @@ class RecorderOptions(Config, frozen=True):
     # The nodes to record: first those with frames (`streams`), whose end ends the recording.
     sources: Names = ("camera", "mapper")
     streams: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many of the sources, from the first on, are cameras
-    topics: tuple[str, ...] = ("info", "frame", "refused", "status")  # "map" may be added
+    topics: tuple[Recorded, ...] = ("info", "frame", "refused", "status")  # "map" may be added
     overwrite: bool = False  # replace a log that is there; where there are splits, with all its parts
     source_timeout_s: Positive = 180.0  # how long the others may take to start
     split_mb: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part before one grows beyond this; 0 = any size

@@ -35,6 +35,7 @@ from semantic_mapper.setting_docs import settings_of
 
 MAX_SHOWN = 500  # rows that are printed
 MAX_LOGS = 40
+Operation = Literal["map", "eval", "autolabel", "finetune", "refine"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -54,7 +55,7 @@ def _settings(ctx: typer.Context, incomplete: str) -> list[str]:
 @verb
 def run(
     output: JsonOutput,
-    operation: Literal["map", "eval", "autolabel", "finetune", "refine"],  # as the verb
+    operation: Operation,  # as the verb
     # paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are tags). refine: maps
     # (.npz)
     logs: list[str],
@@ -157,7 +158,7 @@ def compare(
     store_a: str,  # path or URL of the store with results before
     store_b: str,  # of that with results after
     *,
-    operation: str = "",  # replay, eval, ...; not needed where A has results of one only
+    operation: Operation | None = None,  # not needed where A has results of one only
     metric: str = "miou",  # miou, "miou METHOD", iou:CLASS, or another metric or cost
     threshold: AtLeastZero = 0.0,  # allowed loss of the mean over logs, in units of the metric
     log_threshold: AtLeastZero = 0.02,  # allowed loss of a single log
@@ -179,7 +180,7 @@ def compare(
     """
     limits = {"threshold": threshold, "log_threshold": log_threshold, "lower_is_better": lower_is_better}
     with wrong_usage(SemanticMapperError):
-        found = compare_stores(Store(store_a), Store(store_b), operation, metric, **limits)
+        found = compare_stores(Store(store_a), Store(store_b), operation or "", metric, **limits)
     output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})
     _show_comparison(output, found)
     return EXIT_FAILED if found.reasons else 0

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, HeightM, load_config, nearest
+from semantic_mapper.config import AtLeastOne, AtLeastZero, HeightM, load_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.nodes.cli.calibrate import board_settings
@@ -19,7 +19,7 @@ from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import MEGAPIXELS, ImportOptions, ImportReport, RenameConfig
 from semantic_mapper.replay.importers.ros_bags import is_bag
-from semantic_mapper.replay.importers.run import FORMATS, import_recording, is_recording
+from semantic_mapper.replay.importers.run import Format, import_recording, is_recording
 from semantic_mapper.replay.log.format import recover
 from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.sfm.film import FILM_SUFFIXES, pictures_of
@@ -85,7 +85,7 @@ def import_(
     *,
     # folder, tum, icl, scannet, replica, nice-slam, 7-scenes, kitti360, rosbag, polycam, record3d, transforms,
     # colmap, opensfm [found out]
-    format_: str | None = None,
+    format_: Annotated[Format | None, typer.Option("--format", metavar="FORMAT")] = None,
     max_frames: MaxFramesOption = 0,
     every: AtLeastOne = 1,  # only every N-th frame
     megapixels: AtLeastZero = MEGAPIXELS,  # larger pictures of a recording are made smaller; 0 = never
@@ -102,8 +102,6 @@ def import_(
     Example: semantic-mapper import film.mp4 film.mcap --camera-height 1.5
     Example: semantic-mapper import cut-off.mcap clean.mcap
     """
-    if format_ not in (None, *FORMATS):
-        raise typer.BadParameter(f"'{format_}' is not valid{nearest(format_, list(FORMATS))}", param_hint="--format")
     renames = load_config(rename, RenameConfig).classes if rename is not None else {}
     reading = ImportOptions(every, max_frames or None, megapixels=megapixels, renames=renames)
     if format_ is None and source.suffix == LOG_SUFFIX and not is_bag(source):
@@ -129,7 +127,7 @@ def import_source(
     source: Path,
     log: Path,
     options: SourceOptions,
-    format_name: str | None = None,
+    format_name: Format | None = None,
     reading: ImportOptions | None = None,
     *,
     overwrite: bool,

@@ -10,7 +10,7 @@ import typer
 
 from semantic_mapper.config import AtLeastOne
 from semantic_mapper.errors import LogError
-from semantic_mapper.nodes.cli.verb import JsonOutput, Port, must_be_there, refuse_options, verb
+from semantic_mapper.nodes.cli.verb import JsonOutput, Port, complete_launch, must_be_there, refuse_options, verb
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
 from semantic_mapper.nodes.process import StopRequest
@@ -38,7 +38,7 @@ def label(
     # --suggest: labelled already
     images: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     # endpoint of the finetuner, or socket folder of the launch; by default the one that runs here
-    to: Annotated[str, typer.Option(metavar="PLACE")] = "",
+    to: Annotated[str, typer.Option(metavar="PLACE", autocompletion=complete_launch)] = "",
     suggest: Annotated[int | None, typer.Option(min=1, metavar="N")] = None,  # say which N frames to label next
     serve: bool = False,  # open a page to paint labels, until Ctrl-C
     # --serve: where labels are saved [LOG-labels]

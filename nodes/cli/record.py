@@ -5,17 +5,18 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, get_args
 
 import msgspec
+import typer
 
 from semantic_mapper.config import AtLeastZero, convert_config
 from semantic_mapper.errors import ConfigError, LogError
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, OverwriteOption, SettingOptions, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, OverwriteOption, SettingOptions, complete_launch, verb
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import RecorderOptions
+from semantic_mapper.nodes.options import Recorded, RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder
 from semantic_mapper.nodes.recorder.node import record as record_until_end
@@ -38,15 +39,21 @@ class RecorderSettings(SettingOptions):
     }
 
 
+def _topics(incomplete: str) -> list[str]:
+    return [name for name in get_args(Recorded) if name.startswith(incomplete)]
+
+
 @verb
 def record(
     output: Output,
     log: Path,  # log to write (.mcap); further parts: -1, -2, ...
     recorder: RecorderSettings,
     *,
-    launch: str = "",  # its socket folder; by default the one that runs here
+    # its socket folder, or its file's name; by default the one that runs here
+    launch: Annotated[str, typer.Option(autocompletion=complete_launch)] = "",
     source: list[str] | None = None,  # node to record; repeated. By default cameras and mappers
-    topic: list[str] | None = None,  # repeated. By default info, frame, refused, status; or map
+    # repeated. By default info, frame, refused, status; or map
+    topic: Annotated[list[str] | None, typer.Option(autocompletion=_topics)] = None,
     duration: AtLeastZero = 0.0,  # seconds; 0 = to the end of the stream, or Ctrl-C
     jpeg: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0,  # quality of colour images; 0 = as they are, lossless
     overwrite: OverwriteOption = False,

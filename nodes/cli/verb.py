@@ -313,7 +313,8 @@ def _parameter(name: str, kind: Any, info: ParameterInfo, default: Any) -> inspe
     """A parameter as Typer wants it; what its type says to Typer goes before ``info``."""
     given = next((note for note in get_args(kind) if isinstance(note, ParameterInfo)), None)
     if given is not None:
-        given.help, given.show_default = given.help or info.help, info.show_default
+        given.help, given.metavar = given.help or info.help, given.metavar or info.metavar
+        given.show_default = info.show_default
     else:
         declared, low, high = without_bounds(kind)
         kind = Annotated[declared | None if default is None else declared, info, msgspec.Meta(ge=low, le=high)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
@@ -28,7 +29,11 @@ from semantic_mapper.replay.sfm.colmap import find_models
 from semantic_mapper.replay.sfm.film import PICTURE_SUFFIXES
 from semantic_mapper.transport.images import CodecOptions
 
-FORMATS: dict[str, Callable[[Path, ImportOptions], PosedPictures]] = {  # layouts.toml shows the files of each
+Format = Literal[
+    "folder", "tum", "icl", "scannet", "replica", "nice-slam", "7-scenes", "kitti360", "rosbag", "polycam", "record3d",
+    "transforms", "colmap", "opensfm",
+]  # fmt: skip
+FORMATS: dict[Format, Callable[[Path, ImportOptions], PosedPictures]] = {  # layouts.toml shows the files of each
     "folder": open_folder,
     "tum": open_tum,
     "icl": open_icl,

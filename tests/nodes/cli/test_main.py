@@ -61,6 +61,10 @@ def test_a_shell_completes_settings_their_values_launches_and_classes(
         ("up cam", ["camera"]),
         ("up camera --set camera.ki", ["camera.kind="]),
         ("query li", ["live"]),
+        ("record x --launch li", ["live"]),
+        ("record x --topic f", ["frame"]),
+        ("import x y --format r", ["replica", "rosbag", "record3d"]),
+        ("fleet compare a b --operation e", ["eval"]),
         (f"query {MAP} nearest ch", ["chair"]),
     ):
         monkeypatch.setenv("COMP_WORDS", f"semantic-mapper {words}".replace(" ", "\n"))
