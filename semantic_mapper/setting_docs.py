@@ -46,18 +46,19 @@ class Setting:
         return "list" if get_origin(self.type) in (tuple, list) else "table or text"
 
 
-def settings_of(kind: type[msgspec.Struct], prefix: str = "") -> Iterator[Setting]:
-    """The settings of a struct, and those of the structs in it."""
+def settings_of(kind: type[msgspec.Struct], prefix: str = "", made: object = None) -> Iterator[Setting]:
+    """The settings of a struct, and those of the structs in it; defaults are those of ``made``, if there is one."""
     texts = comments_of(kind)
     hints = get_type_hints(kind, include_extras=True)
     for item in msgspec.structs.fields(kind):
         declared, low, high = without_bounds(hints[item.name])
-        if isinstance(declared, type) and issubclass(declared, msgspec.Struct) and not item.required:
-            yield from settings_of(declared, f"{prefix}{item.name}.")
-            continue
         default = item.default
         if item.default_factory is not msgspec.NODEFAULT:
             default = item.default_factory()
+        default = getattr(made, item.name, default)
+        if isinstance(declared, type) and issubclass(declared, msgspec.Struct) and not item.required:
+            yield from settings_of(declared, f"{prefix}{item.name}.", default)
+            continue
         yield Setting(prefix + item.name, declared, low, high, default, texts.get(item.name, ""))
 
 

@@ -43,6 +43,11 @@ PAGES: dict[str, tuple[str, type[msgspec.Struct]]] = {
     **{f"A camera of kind {kind}": ("`camera.config` of a camera node", config) for kind, config in _CAMERAS.items()},
     **{f"Poses of kind {kind}": ("`camera.poses` of a camera node", config) for kind, config in KINDS.items()},
 }
+# Tables that another section lists, too: where, and below which name. Other defaults are said.
+_ELSEWHERE: dict[str, tuple[str, type[msgspec.Struct], str]] = {
+    "step.sampling.": ("The mapper", MapperConfig, "sampling."),
+    "finetune.": ("Finetuning", FinetuneConfig, ""),
+}
 
 
 def page() -> str:
@@ -50,7 +55,7 @@ def page() -> str:
     parts = [HEAD]
     for title, (where, kind) in PAGES.items():
         parts += [f"## {title}\n\n{where}\n\n| name | type | default | meaning |\n|---|---|---|---|"]
-        parts += [_row(setting) for setting in _without_shapes(kind)]
+        parts += dict.fromkeys(map(_row, _without_shapes(kind)))
         parts += [""]
     return "\n".join(parts)
 
@@ -61,6 +66,11 @@ def _without_shapes(kind: type[msgspec.Struct]) -> Iterator[Setting]:
 
 
 def _row(setting: Setting) -> str:
+    for table, (title, kind, name) in _ELSEWHERE.items():
+        if setting.name.startswith(table):
+            there = {s.name: s.default for s in settings_of(kind)}
+            if there[name + setting.name.removeprefix(table)] == setting.default:
+                return f"| `{table}*` | | | the others as in [{title}](#{title.lower().replace(' ', '-')}) |"
     text = setting.text.replace("|", "\\|")
     return f"| `{setting.name}` | {setting.kind} | {_shown(setting.default)} | {text} |"
 
