@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import zstandard
 
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.imaging import resize_depth, resize_label, working_intrinsics
@@ -36,8 +37,7 @@ class _TruthView(NamedTuple):
     stamp_ns: int
     T_world_camera: Float64
     intrinsics: CameraIntrinsics
-    depth_m: Float32
-    label: UInt8
+    packed: bytes  # depth, float32 metres, and label of every pixel, by Zstandard
 
 
 class SurfaceTruth:
@@ -56,7 +56,8 @@ class SurfaceTruth:
         if self._seen % self._stride == 0:
             k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
             depth, label = resize_depth(frame, k), resize_label(frame.label, k)
-            self._frames.append(_TruthView(frame.camera_id, frame.stamp_ns, frame.T_world_camera, k, depth, label))
+            packed = zstandard.compress(depth.tobytes() + label.tobytes(), 1)
+            self._frames.append(_TruthView(frame.camera_id, frame.stamp_ns, frame.T_world_camera, k, packed))
         self._seen += 1
         if len(self._frames) > MAX_FRAMES:
             self._frames = self._frames[::2]
@@ -76,9 +77,12 @@ class SurfaceTruth:
         for view in self._frames:
             p = transform(invert_pose(view.T_world_camera), points)
             inside, row, column = nearest_pixels(p, view.intrinsics)
-            measured = view.depth_m[row, column]
+            size = view.intrinsics.height, view.intrinsics.width
+            pixels = np.frombuffer(zstandard.decompress(view.packed), np.uint8)
+            depth, label = pixels[: -size[0] * size[1]], pixels[-size[0] * size[1] :]
+            measured = depth.view(np.float32).reshape(size)[row, column]
             visible = inside & (measured > 0) & (np.abs(measured - p[:, 2]) < AGREEMENT_M)
-            channel = self._label_set.to_channels(view.label)[row, column]
+            channel = self._label_set.to_channels(label.reshape(size))[row, column]
             index = np.flatnonzero(visible & (channel != IGNORE_CHANNEL))
             votes[index, channel[index]] += 1
         channel = np.where(votes.any(axis=1), votes.argmax(axis=1), IGNORE_CHANNEL)

@@ -44,6 +44,7 @@ EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting ou
 TILE_BLOCKS = 4096  # blocks read at a time; Open3D fails past 262,100, and needs 8 KiB a block to mesh
 SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+_MOVED_BYTES = 1 << 22  # a whole number of pages
 _READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room next to both
 _FREE = -1  # no packed key is negative
 _NO_SURFACE, _SURFACE, _UNKNOWN = 0, 1, 2  # whether a block holds a surface; unknown since it was last changed
@@ -375,7 +376,7 @@ class BlockGrid:
         _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
         larger = self._make_buffers(capacity)
         for values, grown in zip(self._buffers, larger, strict=True):
-            grown[:before] = values
+            _move(values, grown)
         self._buffers = larger
         more = capacity - before
         self._packed = np.pad(self._packed, (0, more), constant_values=_FREE)
@@ -411,6 +412,16 @@ def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def _move(values: NDArray[Any], grown: NDArray[Any]) -> None:
+    """Copy an array of ``_zeros`` piece by piece, giving back each piece's memory: little is ever held twice."""
+    old, new = (a.reshape(-1).view(np.uint8) for a in (values, grown))
+    memory: mmap.mmap = values.base.base.obj  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    for start in range(0, len(old), _MOVED_BYTES):
+        piece = slice(start, min(start + _MOVED_BYTES, len(old)))
+        new[piece] = old[piece]
+        memory.madvise(mmap.MADV_DONTNEED, start, piece.stop - start)
 
 
 @kernel
