@@ -125,7 +125,7 @@ class MapSession:
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.left_out = 0  # by the import that has made the log
-        self.scale_from = ""  # what the metres of the stream come from, where poses are of pictures
+        self.scale_from = ""  # what the metres of the stream come from, where that is found or assumed
         self.without_depth = 0  # their geometry was rendered, not measured
         self.outside = 0  # that weights of one scene know less than half of
         self._known, self._mapped = 0.0, 0  # fractions of frames that they know, in sum; frames

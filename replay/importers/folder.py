@@ -68,7 +68,7 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
     color = numbered_files(folder / "color", PICTURES, notices)
     if not color:
         raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
-    lens, given, metric = read_intrinsics(folder / "intrinsics.json", notices, list(color.values()))
+    lens, given, scale_from = read_intrinsics(folder / "intrinsics.json", notices, list(color.values()))
     poses = read_pose_rows(folder / "poses.txt", color.keys())
     notices += without_picture("row of poses.txt", poses, color, folder / "color")
     stamps = read_stamps(folder / "timestamps.txt", max(color) + 1, DEFAULT_HZ, notices)
@@ -105,7 +105,10 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
         )
     source = f"folder {folder.resolve().name}"
     scale = given or DEPTH_SCALE
-    return PosedPictures(source, pictures, options, scale, notices, metric=metric, hz=DEFAULT_HZ, labels=label_set)
+    scale_from = scale_from or ("" if given or not depth else f"depth of {scale}")
+    return PosedPictures(
+        source, pictures, options, scale, notices, scale_from=scale_from, hz=DEFAULT_HZ, labels=label_set
+    )
 
 
 def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
@@ -149,8 +152,8 @@ def _label_set(labels: _Labels, folder_name: str) -> LabelSet:
 
 def read_intrinsics(
     file: Path, notices: list[str], pictures: Sequence[Path]
-) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
-    """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
+) -> tuple[CameraIntrinsics, DepthScale | None, str]:
+    """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and ``SCALE_UNKNOWN`` or "" of poses.
 
     The first of ``pictures`` that can be read tells the size where the file does not. ``notices`` gets a sentence on
     keys that are not read. Raises ImportSourceError: missing, or a value that cannot be.
@@ -168,4 +171,4 @@ def read_intrinsics(
     size = (i.width, i.height) if i.width and i.height else first_size(pictures, file)
     model = "fisheye" if i.fisheye else i.camera_model
     lens = camera_of(file, (i.fx, i.fy, i.cx, i.cy), size, model, i.distortion or ())
-    return lens, scale, i.scale != SCALE_UNKNOWN
+    return lens, scale, SCALE_UNKNOWN if i.scale == SCALE_UNKNOWN else ""

@@ -36,6 +36,7 @@ from semantic_mapper.replay.importers.tables import (
 from semantic_mapper.replay.sfm.colmap import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition, place_by_gps, read_position
 from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64
 
 FILE = "reconstruction.json"  # of OpenSfM
@@ -234,7 +235,7 @@ def _opened(
     unposed = sorted(str(file) for file in there if file.suffix.lower() in PICTURES and file not in names)
     notices += left_out_notice("picture", unposed, "without a pose in this model")
     poses = np.stack([picture.pose for picture in pictures if not isinstance(picture.pose, BadFrameError)])
-    metric, scale, depth = True, 1.0, _median_depth(points, pictures, poses)
+    scale_from, scale, depth = "GPS, by OpenSfM", 1.0, _median_depth(points, pictures, poses)
     fit = None
     if origin is None and options.scale is None:
         try:
@@ -245,9 +246,14 @@ def _opened(
         notices.append("scale, up and north are those that OpenSfM found by GPS")
     elif fit is not None:
         notices.append(f"scale, up and north: {fit}")
-        origin, scale, poses = fit.origin, fit.scale, np.stack([fit.moved(pose) for pose in poses])
+        scale_from, origin, scale, poses = (
+            str(fit),
+            fit.origin,
+            fit.scale,
+            np.stack([fit.moved(pose) for pose in poses]),
+        )
     else:
-        metric, poses = False, upright(poses[0], camera_up(poses)) @ poses
+        scale_from, poses = SCALE_UNKNOWN, upright(poses[0], camera_up(poses)) @ poses
         if options.scale is None:
             poses[:, :3, 3] *= UNSCALED_DEPTH_M / depth if depth > 0 else 1.0
     opened = PosedPictures(
@@ -256,10 +262,10 @@ def _opened(
         options,
         DepthScale(1000.0, convention=f"a model of {source} has no depth images"),
         notices,
-        metric=metric,
+        scale_from=scale_from,
     )
     metadata = {} if origin is None else {ORIGIN_KEY: str(origin)}
-    if metric or options.scale is not None:
+    if opened.info.scale_known:
         metadata |= scene_depth((options.scale or scale) * depth)
     opened.info = msgspec.structs.replace(opened.info, metadata={**opened.info.metadata, **metadata})
     return opened

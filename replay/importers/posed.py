@@ -84,7 +84,7 @@ class PosedPictures:
         source: What the log names as its source.
         pictures: In their order; where each has a time, in that of the times.
         options, depth_scale, notices: See ``ImportOptions``, ``DepthScale``, ``ImportReport``.
-        metric: Whether lengths are metres.
+        scale_from: What gives lengths in metres, where an error of it would scale the map; or ``SCALE_UNKNOWN``.
         hz: About the rate of the pictures.
         labels: Classes of the label images; None = no labels.
         read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
@@ -100,7 +100,7 @@ class PosedPictures:
         depth_scale: DepthScale,
         notices: Sequence[str],
         *,
-        metric: bool = True,
+        scale_from: str = "",
         hz: float = DEFAULT_HZ,
         labels: LabelSet | None = None,
         read_rgb: Callable[[Path], tuple[UInt8, EncodedImage | None]] = read_rgb,
@@ -116,8 +116,9 @@ class PosedPictures:
         self._pictures, self._stamps_ns = _in_time(_once_each(pictures, self.notices), hz, self.notices)
         self._factor = options.scale or 1.0
         self._rectifiers = lru_cache(KEPT_RECTIFIERS)(Rectifier)  # a picture may have a lens of its own
-        metric = metric or options.scale is not None
-        if not metric:
+        if options.scale is not None:
+            scale_from = f"the stated {options.scale:g} m per unit"
+        elif scale_from == SCALE_UNKNOWN:
             self.notices.append(
                 "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
             )
@@ -142,7 +143,7 @@ class PosedPictures:
             cameras={name: self._smaller(rotate_intrinsics(k, self._quarters)) for name, k in sorted(cameras.items())},
             label_set=labels,
             frame_hz=hz,
-            metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
+            metadata={SCALE_KEY: scale_from} if scale_from else {},
         )
 
     def __len__(self) -> int:

@@ -36,6 +36,7 @@ from semantic_mapper.replay.importers.tables import (
     refuse_keys,
     unknown_notice,
 )
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics
 
 FILE = "transforms.json"
@@ -147,7 +148,8 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
             f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
             f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
         )
-    return PosedPictures(f"transforms {folder.resolve().name}", pictures, options, scale, notices, metric=has_sensor)
+    source, scale_from = f"transforms {folder.resolve().name}", "" if has_sensor else SCALE_UNKNOWN
+    return PosedPictures(source, pictures, options, scale, notices, scale_from=scale_from)
 
 
 def _depth_scale(

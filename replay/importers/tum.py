@@ -78,7 +78,7 @@ def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
             f"{folder}: is ICL-NUIM as TUM's; its poses are of other axes: unpack it again, with associations.txt and "
             "*.gt.freiburg as published"
         )
-    intrinsics, depth_scale = _intrinsics(folder, notices)
+    intrinsics, depth_scale, scale_from = _intrinsics(folder, notices)
     T_marker_camera = _T_M.copy()
     T_marker_camera[:3, :3] = Rotation.from_matrix(_T_M[:3, :3] / _ENLARGED).as_matrix()  # of few digits
     color = _read_list(folder / "rgb.txt", notices)
@@ -86,6 +86,7 @@ def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
         raise ImportSourceError("; ".join((f"{folder / 'rgb.txt'}: holds no line 'stamp file'", *notices[-1:])))
     depth = _read_list(folder / "depth.txt", notices) if (folder / "depth.txt").exists() else []
     if not depth:
+        scale_from = ""
         notices.append("no depth.txt, or no image in it: frames come without depth")
     stamps_ns, poses, left_out = read_trajectory(folder / "groundtruth.txt")
     notices += left_out_notice("pose", left_out)
@@ -99,7 +100,7 @@ def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
         elif "rgbd_bonn" in name:
             pose = _T_ROS @ pose @ _T_ROS @ T_marker_camera
         pictures.append(PosedPicture(file, intrinsics, pose, stamp, depth[match][1] if match >= 0 else None))
-    return PosedPictures(f"tum {name}", pictures, options, depth_scale, notices, hz=_HZ)
+    return PosedPictures(f"tum {name}", pictures, options, depth_scale, notices, scale_from=scale_from, hz=_HZ)
 
 
 def open_icl(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -132,18 +133,20 @@ def open_icl(folder: Path, options: ImportOptions) -> PosedPictures:
     return PosedPictures(f"icl {folder.resolve().name}", pictures, options, ICL_SCALE, notices, hz=_HZ)
 
 
-def _intrinsics(folder: Path, notices: list[str]) -> tuple[CameraIntrinsics, DepthScale]:
+def _intrinsics(folder: Path, notices: list[str]) -> tuple[CameraIntrinsics, DepthScale, str]:
+    """Intrinsics, depth scale, and what of them is assumed though the data set may be another one."""
     file = folder / "intrinsics.json"
     usual = BONN_SCALE if "rgbd_bonn" in folder.resolve().name else DEPTH_SCALE
     if file.exists():
         intrinsics, given, _ = read_intrinsics(file, notices, sorted((folder / "rgb").glob("*")))
-        return intrinsics, given or usual
+        return intrinsics, given or usual, "" if given or usual is BONN_SCALE else f"depth of {usual}"
     known = next((k for name, k in _CALIBRATIONS.items() if name in folder.resolve().name), None)
-    if known is None:
-        notices.append(
-            "no intrinsics.json, and no freiburg1, 2, 3 or rgbd_bonn in the name: the ROS default f = 525 is used"
-        )
-    return known or _DEFAULT, usual
+    if known is not None:
+        return known, usual, ""
+    notices.append(
+        "no intrinsics.json, and no freiburg1, 2, 3 or rgbd_bonn in the name: the ROS default f = 525 is used"
+    )
+    return _DEFAULT, usual, f"a camera of f = 525 and depth of {usual}"
 
 
 def _read_list(file: Path, notices: list[str]) -> list[tuple[int, Path]]:
