@@ -23,7 +23,7 @@ from semantic_mapper.replay.log.format import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, hold_folder, map_path
-from semantic_mapper.replay.sfm.scale import scale_by_floor, scene_depth
+from semantic_mapper.replay.sfm.scale import FLOOR_KEY, describe_floor, scale_by_floor, scene_depth
 from semantic_mapper.replay.summary import SUMMARY_FILE, dig, read_summary
 from semantic_mapper.transport.codec import scaled_frame
 from semantic_mapper.transport.messages import SCALE_KEY, SCENE_DEPTH_KEY
@@ -68,7 +68,7 @@ def rescale_run(
     ):
         positions = _positions(reader, summary)
         xyz = VoxelMap.load(path).points().xyz.astype(np.float64)
-        factor, scale = _factor(metres, points, xyz, positions)
+        factor, scale = _factor(metres, points, xyz, positions, reader.info.metadata.get(FLOOR_KEY, ""))
         config = convert_config(summary["config"], MapperConfig, str(folder / SUMMARY_FILE))
         name = Path(str(dig(summary, "weights.file")))
         if weights is None and shipped_checkpoint(Path(name.stem)) is None:
@@ -116,14 +116,17 @@ def _positions(reader: LogReader, summary: dict[str, Any]) -> Float64:
 
 
 def _factor(
-    metres: float, points: tuple[Float64, Float64] | None, xyz: Float64, positions: Float64
+    metres: float, points: tuple[Float64, Float64] | None, xyz: Float64, positions: Float64, floor: str
 ) -> tuple[float, str]:
     """Metres per unit, and how they are found."""
     if not len(xyz):
         raise MapError("the map shows no surface, and so no length that could be known; import the film with a scale")
     if points is None:
-        up = np.array((0.0, 0.0, 1.0))
-        return scale_by_floor(metres, find_floor(xyz, np.median(positions, axis=0), up, _FLOOR_CONE_DEG))
+        middle = np.median(positions, axis=0)
+        if floor and middle[2] > 0:  # of the import, at z = 0
+            return scale_by_floor(metres, float(middle[2]), floor)
+        seen = find_floor(xyz, middle, np.array((0.0, 0.0, 1.0)), _FLOOR_CONE_DEG)
+        return scale_by_floor(metres, 0.0 if seen is None else seen.below, describe_floor(seen))
     for point in points:
         off = float(np.linalg.norm(xyz - point, axis=1).min())
         if off > _NEAR * np.ptp(xyz, axis=0).max():

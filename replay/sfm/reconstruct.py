@@ -37,9 +37,11 @@ from semantic_mapper.replay.sfm.film import (
 )
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, place_by_gps
 from semantic_mapper.replay.sfm.scale import (
+    FLOOR_KEY,
     MIN_BOARD_CORNERS,
     UNSCALED_DEPTH_M,
     ScaleHint,
+    describe_floor,
     find_edges,
     median_depth,
     scale_by_board,
@@ -171,6 +173,7 @@ class _Scene:
     seen: CameraIntrinsics  # of what was seen, with distortion
     scale: str  # how it was found; empty = unknown
     height_m: float | None  # of the camera over the floor
+    floor: str  # at z = 0; empty where it is not, or none is found
     origin: str  # where its origin is on the Earth; empty = not known
 
 
@@ -288,7 +291,9 @@ class _Import:
             T_world_model = fit.T_world_model.copy()
             T_world_model[:3, 3] /= fit.scale
             frames = _moved(frames, T_world_model, fit.scale)
-            return _Scene(frames, seen, str(fit), None if floor is None else fit.scale * floor.below, str(fit.origin))
+            return _Scene(
+                frames, seen, str(fit), None if floor is None else fit.scale * floor.below, "", str(fit.origin)
+            )
         try:
             factor, scale = self._scale(frames, seen, floor)
         except ImportSourceError as error:  # the poses are good: `scale` takes a length later
@@ -298,7 +303,7 @@ class _Import:
         if floor is not None:
             down[2, 3] = floor.below - _middle(frames)[2]
         height = None if floor is None else factor * floor.below
-        return _Scene(_moved(frames, down, factor), seen, scale, height, "")
+        return _Scene(_moved(frames, down, factor), seen, scale, height, describe_floor(floor), "")
 
     def _scale(
         self, frames: dict[int, RegisteredFrame], seen: CameraIntrinsics, floor: Floor | None
@@ -310,7 +315,7 @@ class _Import:
         if self._board is not None:
             return scale_by_board(self._board_seen, _poses(frames), seen)
         if hint.camera_height_m is not None:
-            return scale_by_floor(hint.camera_height_m, floor)
+            return scale_by_floor(hint.camera_height_m, 0.0 if floor is None else floor.below, describe_floor(floor))
         self._notices.append(
             "the scale is unknown: lengths of the log are not metres. Give --scale, --camera-height or --square-mm "
             "(with a printed board in the film), or later a known length of the map (`semantic-mapper scale`)"
@@ -329,6 +334,7 @@ class _Import:
             **scene_depth(median_depth(list(scene.frames.values()))),
             "stamps": "time within the film",
             **({ORIGIN_KEY: scene.origin} if scene.origin else {}),
+            **({FLOOR_KEY: scene.floor} if scene.floor else {}),
         }
         cameras = {CAMERA_ID: rectify.intrinsics}
         info = StreamInfo(f"film {film.path.resolve().name}", cameras, frame_hz=film.hz, metadata=metadata)

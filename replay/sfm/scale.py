@@ -30,6 +30,7 @@ MAX_RAY_ERROR = 0.01  # a place is no further from its rays than this fraction o
 MIN_RAY_FRACTION = 0.5  # of the rays that must do so
 MAX_RAY_PAIRS = 100  # that a place is first found by
 MIN_BOARD_CORNERS = 6
+FLOOR_KEY = "floor"  # metadata of a log whose floor is at z = 0: what is known of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +95,21 @@ def fit_to_scene(config: MapperConfig, info: StreamInfo) -> tuple[MapperConfig, 
     return msgspec.structs.replace(config, voxel_map=voxel_map, depth=fitted_depth), said
 
 
-def scale_by_floor(height_m: float, floor: Floor | None) -> tuple[float, str]:
-    """Metres per unit by a camera's height over a floor, and a sentence on it. Raises ImportSourceError: no floor."""
-    if floor is None:
+def describe_floor(floor: Floor | None) -> str:
+    """What is known of a floor, for people and ``FLOOR_KEY``; empty = none was found."""
+    unsure = ", unsure: little of it is seen, so that the scale may be a tenth off" if floor and floor.unsure else ""
+    return f"a floor of {floor.points} points{unsure}" if floor else ""
+
+
+def scale_by_floor(height_m: float, below: float, floor: str) -> tuple[float, str]:
+    """Metres per unit by a camera's height, which is ``below`` units over a floor of ``describe_floor``, and a sentence
+    on it. Raises ImportSourceError: no floor."""
+    if not floor:
         raise ImportSourceError(
-            "no floor is found under the camera for its height; give a length of the map (`semantic-mapper scale`), or "
-            "film more of the floor"
+            "no floor is found under the camera for its height; give a length of the map (`semantic-mapper scale RUN "
+            "--known`), or film more of the floor"
         )
-    unsure = ", unsure: little of it is seen, so that the scale may be a tenth off" if floor.unsure else ""
-    return (
-        height_m / floor.below,
-        f"the stated camera height of {height_m:g} m over a floor of {floor.points} points{unsure}",
-    )
+    return height_m / below, f"the stated camera height of {height_m:g} m over {floor}"
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:

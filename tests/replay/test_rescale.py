@@ -18,6 +18,7 @@ from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.rescale import rescale_run
+from semantic_mapper.replay.sfm.scale import FLOOR_KEY
 from semantic_mapper.replay.summary import read_summary
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, SCENE_DEPTH_KEY, StreamInfo
 from semantic_mapper.types import CameraIntrinsics
@@ -31,9 +32,12 @@ WALK = walk_frames(3, 12, CAMERA, step_m=0.06)
 SETTINGS = {"voxel_map.voxel_size_m": 0.04, "render.encode_width": 96, "render.scale": 0.25}
 
 
-def write_log(folder: Path, name: str = "room.mcap", source: str = "film", *, depth: bool = False) -> None:
+def write_log(
+    folder: Path, name: str = "room.mcap", source: str = "film", *, depth: bool = False, floor: str = ""
+) -> None:
     """A walk as a film gives it: z = 0 on the floor."""
-    info = StreamInfo(source, {"cam": CAMERA}, metadata={SCALE_KEY: SCALE_UNKNOWN, SCENE_DEPTH_KEY: "1.5"})
+    metadata = {SCALE_KEY: SCALE_UNKNOWN, SCENE_DEPTH_KEY: "1.5", FLOOR_KEY: floor}
+    info = StreamInfo(source, {"cam": CAMERA}, metadata=metadata)
     with LogWriter(folder / name, info, overwrite=True) as writer:
         for frame in WALK:
             pose = frame.T_world_camera.copy()
@@ -102,6 +106,10 @@ def test_what_cannot_be_scaled_is_refused_and_stays(run: Path, tmp_path: Path) -
             rescale_run(run, 1.0, pair)
     rescale_run(run, 1.0, monitor=Stopped())
     assert {file: file.read_bytes() for file in run.iterdir()} == files
+    write_log(run, floor="a floor of 60 points, unsure")  # that of the import is the one that counts
+    report = rescale_run(run, 1.0, monitor=Stopped())
+    assert report.factor == pytest.approx(1 / np.median(UNIT * truth_of(WALK)[:, 2, 3]))
+    assert report.scale == "the stated camera height of 1 m over a floor of 60 points, unsure"
     (run / "summary.json").write_text((run / "summary.json").read_text().replace("rooms.safe", "mine.safe"))
     with pytest.raises(ConfigError, match=r"mapped with mine\.safetensors; name the file with --weights"):
         rescale_run(run, 1.0)
