@@ -17,7 +17,7 @@ import semantic_mapper.drivers.realsense.config
 import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.config import MapperConfig
-from semantic_mapper.drivers.poses.config import KINDS
+from semantic_mapper.drivers.poses.config import KINDS, PoseChecks
 from semantic_mapper.nodes.launcher.launch_file import LaunchFile
 from semantic_mapper.nodes.options import OPTIONS
 from semantic_mapper.setting_docs import Setting, settings_of
@@ -42,6 +42,7 @@ PAGES: dict[str, tuple[str, type[msgspec.Struct]]] = {
     **{f"A node of kind {kind}": ("`[node.options]` of a launch file", options) for kind, options in OPTIONS.items()},
     **{f"A camera of kind {kind}": ("`camera.config` of a camera node", config) for kind, config in _CAMERAS.items()},
     **{f"Poses of kind {kind}": ("`camera.poses` of a camera node", config) for kind, config in KINDS.items()},
+    "Checks of poses": ("`camera.poses.checks`", PoseChecks),
 }
 # Tables that another section lists, too: where, and below which name. Other defaults are said.
 _ELSEWHERE: dict[str, tuple[str, type[msgspec.Struct], str]] = {
