@@ -18,13 +18,7 @@ from semantic_mapper.nodes.fleet.merge import find_maps, merge_maps, read_poses
 from semantic_mapper.nodes.fleet.store import is_url
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.exporters import export_log, log_format_of
-from semantic_mapper.replay.exporters.map_files import (
-    ExportRequest,
-    Format,
-    export_map,
-    format_of,
-    parse_up,
-)
+from semantic_mapper.replay.exporters.map_files import ExportRequest, Format, export_map, format_of, parse_up
 from semantic_mapper.replay.exporters.run import LogFormat
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_log, map_path, prepare_file, prepare_folder, refuse_overwriting
@@ -57,7 +51,7 @@ def export(
 ) -> None:
     """Write a map, or a log, in a format of other programs.
 
-    Maps: .ply points (--format ply-mesh: a mesh), .glb mesh, .npz arrays, .rrd for Rerun, .yaml or .pgm floor plan for
+    Maps: .ply points (--format ply-mesh: a mesh; npz: arrays), .glb mesh, .rrd for Rerun, .yaml or .pgm floor plan for
     nav2 (free only where the floor was seen; --costs: 0 to 100, mode raw, unknown 255). A running mapper gives less
     than its saved map: the likeliest class of a voxel; weight 1, or below for computed depth. Logs: .mcap for Foxglove,
     .txt trajectory (TUM), folder that `import` reads again without loss, --format tum.
@@ -68,6 +62,7 @@ def export(
     """
     map_options = (color, height, resolution, floor, costs, up, min_weight, min_confidence)
     path, live = Path(source), is_running_mapper(source)
+    remote.refuse_unless(live)
     if not live and is_log(path):
         if map_options != (None, None, None, None, None, "auto", SURFACE_WEIGHT, 0.0):
             raise ConfigError(f"{source}: is a log; only --format, --camera and --max-frames are for logs")

@@ -54,12 +54,13 @@ def info(
     Example: semantic-mapper info runs/demo
     Example: semantic-mapper info live
     """
-    path = Path(file[0])
+    path, live = Path(file[0]), is_running_mapper(file[0])
+    remote.refuse_unless(live)
     if path.suffix.lower() in BOX_FILES:
         found = _boxes_info(output, path)
     elif path.suffix == ".safetensors":
         found = _weights_file_info(output, path)
-    elif is_running_mapper(file[0]):
+    elif live:
         found = _live_info(output, file[0], remote)
     elif is_map(path):
         if len(file) > 1:

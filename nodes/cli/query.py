@@ -99,6 +99,7 @@ def query(
     name, point = _read_arguments(question, arguments or [])
     with wrong_usage():
         direction, live = parse_up(up), is_running_mapper(source)
+    remote.refuse_unless(live)
     axis: Up | None = None if direction is None else tuple(direction.tolist())
     refuse_options(
         (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),

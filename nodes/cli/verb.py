@@ -226,6 +226,10 @@ class Remote(Options, frozen=True):
 
         return server_identity(self.server, self.keys)
 
+    def refuse_unless(self, live: bool) -> None:
+        """Refuse these options with what is no running mapper. Raises typer.BadParameter: one was given."""
+        refuse_options((self != type(self)() and not live, "--server, --keys", "go with a running mapper"))
+
 
 def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``.

@@ -14,31 +14,17 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
-from semantic_mapper.mapping.formats import (
-    ColorBy,
-    colored,
-    sure_faces,
-    sure_points,
-    write_glb,
-    write_npz,
-    write_ply,
-)
+from semantic_mapper.mapping.formats import ColorBy, colored, sure_faces, sure_points, write_glb, write_npz, write_ply
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.replay.exporters.base import choose_format
+from semantic_mapper.replay.run_folder import MAP_SUFFIX
 from semantic_mapper.types import Float64
 
 Format = Literal["ply", "ply-mesh", "glb", "npz", "grid", "rrd"]
-SUFFIXES: dict[str, Format] = {
-    ".ply": "ply",
-    ".glb": "glb",
-    ".npz": "npz",
-    ".pgm": "grid",
-    ".yaml": "grid",
-    ".rrd": "rrd",
-}
+SUFFIXES: dict[str, Format] = {".ply": "ply", ".glb": "glb", ".pgm": "grid", ".yaml": "grid", ".rrd": "rrd"}
 FORMATS: tuple[Format, ...] = get_args(Format)
 # Formats that an option is for, besides min_weight and min_confidence.
 _OPTIONS: dict[str, tuple[Format, ...]] = {
@@ -76,7 +62,12 @@ class ExportReport:
 
 
 def format_of(path: Path, given: str | None) -> Format:
-    """See ``choose_format``."""
+    """See ``choose_format``; .npz alone is refused, since saved maps end so."""
+    if given is None and path.suffix.lower() == MAP_SUFFIX:
+        raise ConfigError(
+            f"{path}: so end saved maps, which the mapper writes (a running one at its end, and by save_every_s); "
+            "--format npz writes arrays of points"
+        )
     return choose_format(path, given, SUFFIXES, FORMATS)
 
 

@@ -85,7 +85,7 @@ def look_at_glb(folder: Path) -> dict[str, Any]:
 
 def look_at_npz(folder: Path) -> dict[str, Any]:
     """Arrays by name."""
-    with np.load(export(MAP, folder / "points.npz")) as kept:
+    with np.load(export(MAP, folder / "points.npz", "--format", "npz")) as kept:
         arrays = {name: [kept[name].dtype.kind, kept[name].ndim] for name in kept.files}
         points = Points(kept["xyz"], kept["rgb"], kept["label"], kept["confidence"])
         names = dict(zip(map(str, kept["label_ids"].tolist()), kept["label_names"].tolist(), strict=True))
