@@ -6,6 +6,7 @@ Text is shown as it is: nothing in it is markup, and what would steer the termin
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import time
@@ -191,11 +192,18 @@ def frame_progress(
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}", "cyan", markup=False),
-        TextColumn("eta"),
+        TextColumn("left"),
         TimeRemainingColumn(),
+        TextColumn("elapsed"),
         TimeElapsedColumn(),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    console = stderr_console()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        yield FrameProgress(progress, what, total, unit, stop)
+    console, log = stderr_console(), structlog.get_config()
+    if console.is_terminal and not _log.is_enabled_for(logging.DEBUG):  # the bar tells it; warnings stand above it
+        structlog.configure(**{**log, "wrapper_class": structlog.make_filtering_bound_logger("warning")})
+    try:
+        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+            yield FrameProgress(progress, what, total, unit, stop)
+    finally:
+        if console.is_terminal:
+            structlog.configure(**log)

@@ -74,18 +74,16 @@ def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
     return figures_table("map", summaries, _ROWS, _ROWS_BY_NAME)
 
 
-def headlines(summary: Mapping[str, Any]) -> list[str]:
-    """What became of a run, in a few lines; the report has the table."""
-    frames, scored = summary["frames"], dig(summary, "metrics.miou")
-    unsure = "".join(
-        f", {percent(fraction)} {what}"
-        for path, what in (("map.unknown", "of an unknown class"), ("map.computed", "computed, not measured"))
-        if (fraction := dig(summary, path))
-    )
+def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
+    """What became of a run, what to know of it, and where its pictures and its map are, a line each; the report has
+    the other figures."""
+    ms, unknown, scored = (dig(summary, path) for path in ("latency_ms.p50", "map.unknown", "metrics.miou"))
     lines = [
-        f"{frames['fused']} of {counted(frames['published'], 'frame')} of {summary['source']} mapped by the weights "
-        f"{dig(summary, 'weights.file')}",
-        f"{dig(summary, 'map.surface_points'):,} surface points in voxels of {_voxel_size(summary)}{unsure}",
+        f"{summary['frames']['fused']} of {counted(summary['frames']['published'], 'frame')} mapped by "
+        f"{dig(summary, 'weights.file')}"
+        + ("" if ms is None else f", {_ms(ms)} a frame (p95 {_ms(dig(summary, 'latency_ms.p95'))})"),
+        f"{dig(summary, 'map.surface_points'):,} surface points in voxels of {_voxel_size(summary)}"
+        + (f", {percent(unknown)} of an unknown class" if unknown else ""),
     ]
     if (disagreement := dig(summary, "pose_check.depth_disagreement")) is not None:
         lines.append(f"poses and depth disagree in {percent(disagreement)} of what two frames see")
@@ -93,20 +91,11 @@ def headlines(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"known to the weights: {_scene_known(scene)}")
     if scored is not None:
         lines.append(f"{percent(scored)} mIoU, {percent(dig(summary, 'metrics.total_accuracy'))} of the pixels right")
-    if (ms := dig(summary, "latency_ms.p50")) is not None:
-        memory = dig(summary, "map.memory_mb")
-        lines.append(f"{_ms(ms)} a frame (p95 {_ms(dig(summary, 'latency_ms.p95'))}), the map {memory} MB")
+    lines += notes(summary)
+    for names, text in _RESULTS.items():
+        if there := [name for name in names if (out / name).exists()]:
+            lines.append(text.format(" and ".join([str(out / there[0]), *there[1:]])))
     return lines
-
-
-def result_lines(out: Path) -> list[str]:
-    """Where the results are."""
-    return [f"  {out / name}  ({text})" for name, text in _RESULTS.items() if (out / name).exists()]
-
-
-def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
-    """What became of a run, what to know of it, and its files, a line each."""
-    return [*headlines(summary), *notes(summary), *result_lines(out)]
 
 
 def notes(summary: Mapping[str, Any]) -> list[str]:
@@ -115,13 +104,12 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     warnings = [empty, *(text for text in others if text not in empty)]  # it says why
     lines = [f"warning: {warning}" for warning in (*warnings, *(dig(summary, "pictures.notes") or ())) if warning]
     for path, text in _DEPTH_NOTES.items():
-        if fraction := dig(summary, path):
+        fraction = dig(summary, path)
+        if fraction and (path, fraction) != ("map.computed", 1):  # the frames say it
             lines.append(text.format(percent(fraction)))
     unused = frames.get("published", 0) - sum(frames.get(name, 0) for name in ("dropped", "refused", "fused"))
     if unused and dig(summary, "depth.computed_fraction"):
-        lines.append(
-            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure"
-        )
+        lines.append(f"{counted(unused, 'frame')} added nothing to the map: no depth was found, or it was too unsure")
     if summary.get("scale") == "unknown":
         lines.append(f"scale: unknown; lengths of this map are not metres, what needs metres is refused: {SCALE_FIX}")
     elif scale := summary.get("scale_from"):
@@ -143,15 +131,12 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
 
 _WARNINGS = ("map.nearly_empty", "pose_check.warning", "depth.range_warning", "pictures.unlike_training_warning")
 _RESULTS = {
-    "overview.png": "picture",
-    "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
-    "map.npz": "the map itself, for `query`, `view` and `export`",
-    "report.html": "report on one page, for a browser",
-    "summary.json": "all figures",
+    ("report.html", "overview.png"): "pictures: {}",
+    ("map.npz", "map.ply"): "map: {}, for `query`, `view`, `export`",
 }
 _DEPTH_NOTES = {
-    "depth.computed_fraction": "depth: computed from the pictures for {} of the frames, which have no sensor depth; "
-    "expect a surface less exact than a sensor's, and holes in plain walls",
+    "depth.computed_fraction": "depth: computed from the pictures for {} of the frames: less exact than a sensor's, "
+    "with holes in plain walls",
     "depth.rendered_fraction": "depth: rendered by the field for {} of the frames, which have no sensor depth; "
     "geometry is less exact than with a depth sensor",
     "map.computed": "surface: {} of its points were computed, not measured by a sensor; `export --min-weight 1` leaves "

@@ -63,7 +63,7 @@ def demo(
             summary, _ = replay_log(demo_log(), out, weights, mapper.load(), monitor=bar)
         for line in ending(summary, out):
             output.print(line)
-        output.print(f"  {demo_log()}  (the log it was made from)")
+        output.print(f"log: {demo_log()}")
         ended = "stopped after" if stop else "done in"
         stderr_console().print(
             f"{ended} {time.monotonic() - began:.0f} s; next: `semantic-mapper query {out} nearest chair 0 0 1`"
