@@ -44,8 +44,10 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
     }
 
 
-def answer_at(labels: LabelSet, point: Sequence[float], answers: PointAnswers) -> dict[str, Any]:
-    """What is at a point: the answers of ``nearest.at`` to it alone."""
+def answer_at(
+    labels: LabelSet, point: Sequence[float], answers: PointAnswers, things: Sequence[Instance]
+) -> dict[str, Any]:
+    """What is at a point: the answers of ``nearest.at`` to it alone, and in the boxes of which things it lies."""
     label = int(answers.label[0])
     known = np.isfinite(answers.distance_m[0])
     return {
@@ -56,19 +58,20 @@ def answer_at(labels: LabelSet, point: Sequence[float], answers: PointAnswers) -
         "surface_distance_m": round(float(answers.distance_m[0]), DIGITS) if known else None,
         "state": State(int(answers.state[0])).name.lower(),
         "measured": bool(answers.measured[0]) if known and answers.measured is not None else None,
+        "inside": [{"id": thing.id, "class": thing.class_name} for thing in things if thing.box.holds(point)],
     }
 
 
 def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface | None) -> dict[str, Any]:
-    """Where the nearest surface of a class is, as ``nearest.nearest`` says."""
+    """Where the nearest surface of a class is, and the thing there, as ``nearest.nearest`` says."""
     found: dict[str, Any] = {"question": "nearest", "class": class_name, "point": list(point), "found": hit is not None}
     if hit is not None:
         found |= {"xyz": _rounded(hit.xyz), "distance_m": round(hit.distance_m, DIGITS)}
         found |= {"confidence": round(hit.confidence, DIGITS), "measured": hit.measured}
+        found["thing"] = None if hit.thing is None else _describe_thing(hit.thing)
     return found
 
 
-UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
 NO_FLOOR = "no floor was found: too little level surface, or another direction is up (--up)"
 
 

@@ -85,31 +85,35 @@ class MapClient(Closing):
         return self._ask(questions.AtRequest(points=as_numbers(points, "points"), radius_m=radius_m))
 
     def nearest(
-        self, class_name: str, point: ArrayLike, min_confidence: float = 0.0, *, unsure: bool = False
+        self,
+        class_name: str,
+        point: ArrayLike,
+        min_confidence: float = 0.0,
+        *,
+        unsure: bool = False,
+        up: ArrayLike = UP,
     ) -> NearestSurface | None:
-        """The nearest surface of a class; see ``queries.nearest.nearest``."""
+        """The nearest surface of a class, and the thing there, with its id of ``instances``; see
+        ``queries.nearest.nearest``."""
+        place, axis = _point(point, "point"), _point(up, "up")
         return self._ask(
             questions.NearestRequest(
-                class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence, unsure=unsure
+                class_name=class_name, point=place, min_confidence=min_confidence, unsure=unsure, up=axis
             )
         )
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
         """The first surface that each ray meets; see ``queries.surface.cast_rays``."""
-        return self._ask(
-            questions.RaysRequest(
-                origins=np.atleast_2d(as_numbers(origins, "origins")),
-                directions=np.atleast_2d(as_numbers(directions, "directions")),
-                max_m=max_m,
-            )
-        )
+        start = np.atleast_2d(as_numbers(origins, "origins"))
+        step = np.atleast_2d(as_numbers(directions, "directions"))
+        return self._ask(questions.RaysRequest(origins=start, directions=step, max_m=max_m))
 
     def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
         """Surface points in a box; see ``queries.surface.points_in_box``."""
         return self._ask(questions.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper")))
 
     def instances(self, up: ArrayLike = UP, *, gone: bool = False, unsure: bool = False) -> tuple[Instance, ...]:
-        """Things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
+        """Things; their ids stay from call to call, whatever is ``up``; see ``queries.instances.InstanceTracker``.
 
         With ``unsure``, also those of low certainty. With ``gone``, behind them also those of earlier answers that
         have gone since (``Instance.gone_ns``), the latest 64.

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 from rich.table import Table
 
-from semantic_mapper.client import MapClient
+from semantic_mapper.client import UP, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
 from semantic_mapper.labels import PLAIN_NAMES
@@ -35,9 +37,10 @@ from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, draw_graph
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.nearest import at, nearest
+from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
@@ -46,6 +49,7 @@ from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 Up = tuple[float, float, float]
+Things = tuple[Instance, ...]
 Question = Literal["info", "at", "nearest", "instances", "graph", "relocalize"]
 ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "relocalize": "LOG"}
 
@@ -144,27 +148,27 @@ def answer(
     picture: Path | None = None,
 ) -> dict[str, Any]:
     """The answer of a running mapper or of a saved map, as plain data; the arguments are those of ``query``."""
+    saved = isinstance(world_map, MapSnapshot)
     match question:
         case "info":
-            return map_answers.describe_map(
-                world_map if isinstance(world_map, MapSnapshot) else world_map.mirror().snapshot()
-            )
+            return map_answers.describe_map(world_map if saved else world_map.mirror().snapshot())
         case "at":
-            is_saved = isinstance(world_map, MapSnapshot)
-            labels = (world_map if is_saved else world_map.info()).label_set
-            found = at(world_map, [point]) if is_saved else world_map.at([point])
-            return map_answers.answer_at(labels, point, found)
+            about = world_map if saved else world_map.info()
+            things = _instances(world_map, _axis(world_map, up)) if about.scale_known else ()
+            ask = partial(at, world_map) if saved else world_map.at
+            found, far_m = ask([point]), MAX_RADIUS_VOXELS * about.voxel_size_m
+            if np.isinf(found.distance_m[0]):  # the class of what is so far away is not the one here
+                found = replace(found, distance_m=ask([point], far_m).distance_m, measured=None)
+            return map_answers.answer_at(about.label_set, point, found, things)
         case "nearest":
-            ask = partial(nearest, world_map) if isinstance(world_map, MapSnapshot) else world_map.nearest
-            hit = ask(class_name, point, min_confidence, unsure=unsure)
+            ask = partial(nearest, world_map) if saved else world_map.nearest
+            hit = ask(class_name, point, min_confidence, unsure=unsure, up=_axis(world_map, up))
             return map_answers.answer_nearest(class_name, point, hit)
         case "instances":
-            axis = up or (_up_in(world_map) if isinstance(world_map, MapSnapshot) else map_answers.UP)
-            if isinstance(world_map, MapSnapshot):
-                return map_answers.answer_instances(axis, InstanceTracker(up=axis).update(world_map, unsure=unsure))
-            return map_answers.answer_instances(axis, world_map.instances(axis, gone=gone, unsure=unsure))
+            axis = _axis(world_map, up)
+            return map_answers.answer_instances(axis, _instances(world_map, axis, gone, unsure))
         case _:  # the graph
-            graph = GraphTracker(up).update(world_map) if isinstance(world_map, MapSnapshot) else world_map.graph(up)
+            graph = GraphTracker(up).update(world_map) if saved else world_map.graph(up)
             if picture is not None:
                 if not graph.floors:
                     raise MapError(f"there is nothing to draw: {map_answers.NO_FLOOR}")
@@ -172,12 +176,17 @@ def answer(
             return map_answers.answer_graph(graph)
 
 
-def _up_in(saved: MapSnapshot) -> tuple[float, ...]:
-    """Away from the floor, as in the graph; z of the world where no floor shows it."""
-    try:
-        return tuple(GraphTracker().up_in(saved).tolist())
-    except MapError:
-        return map_answers.UP
+def _axis(world_map: MapClient | MapSnapshot, up: Up | None) -> Up:
+    """As given; else of a saved map away from the floor, as in the graph; else z of the world."""
+    with suppress(MapError):
+        return up or (tuple(up_in(world_map).tolist()) if isinstance(world_map, MapSnapshot) else UP)
+    return UP
+
+
+def _instances(world_map: MapClient | MapSnapshot, up: Up, gone: bool = False, unsure: bool = False) -> Things:
+    if isinstance(world_map, MapSnapshot):
+        return InstanceTracker(up=up).update(world_map, unsure=unsure)
+    return world_map.instances(up, gone=gone, unsure=unsure)
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
@@ -232,12 +241,33 @@ def answer_table(found: dict[str, Any]) -> Table:
     if found["question"] == "graph":
         return _graph_table(found)
     unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
-    plain = {key: value for key, value in found.items() if not isinstance(value, dict)}
+    plain = {key: value for key, value in found.items() if not isinstance(value, dict)} | _in_words(found)
     plain |= {key: f"{_joined(value)} {unit}" for key, value in plain.items() if isinstance(value, list)}
     rows = [(key.replace("_", " "), "none" if value is None else str(value)) for key, value in plain.items()]
     classes = sorted(found.get("classes", {}).items(), key=lambda item: -item[1])
     rows += [(name, counted(count, "surface voxel")) for name, count in classes if count]
     return table(rows, title=found["map"])
+
+
+def _in_words(found: dict[str, Any]) -> dict[str, Any]:
+    """Of ``at`` and ``nearest``, what names things or needs a word more."""
+    words: dict[str, Any] = {}
+    if "inside" in found:
+        words["inside"] = ", ".join(f"the box of {_title(thing)}" for thing in found["inside"]) or "no box of a thing"
+        if found["surface_distance_m"] is None:
+            words["surface_distance_m"] = f"none within {MAX_RADIUS_VOXELS:.0f} voxels"
+        if found["state"] == "unknown":
+            words["state"] = "unknown: not seen"
+    if thing := found.get("thing"):
+        words |= {"thing": _title(thing), "center": thing["box"]["center"], "box": thing["box"]["size"]}
+        words |= {key: f"{thing[key] * 100:.0f} %" for key in ("certainty", "seen")}
+    elif "thing" in found:
+        words["thing"] = "none: surface alone"
+    return words
+
+
+def _title(thing: dict[str, Any]) -> str:
+    return f"{PLAIN_NAMES.get(thing['class'], thing['class'])} {thing['id']}"
 
 
 def _instance_table(found: dict[str, Any]) -> Table:

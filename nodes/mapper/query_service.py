@@ -20,6 +20,7 @@ from typing import Any
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingSpace
@@ -28,7 +29,7 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
-from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import Request, encode_error
@@ -48,7 +49,6 @@ MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
 MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
 MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, and the rest of a version
-_MAX_TRACKERS = 4  # one for each direction that was called up
 _POLL_S = 0.5
 _NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"
 _TOO_MANY = "too many questions wait for an answer; ask again later, and await each answer"
@@ -100,8 +100,7 @@ class QueryService(Closing):
         self._last_pose = last_pose
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        # By direction, the last one used last: a tracker, and what it found last, in which version of the map.
-        self._tracked: dict[questions.Point, tuple[InstanceTracker, int, tuple[Instance, ...]]] = {}
+        self._tracker = InstanceTracker()
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
@@ -225,9 +224,14 @@ class QueryService(Closing):
                     if pending.request.about_map:
                         self._listened_until = time.monotonic() + LISTENED_S
             elif not (lags and pending.request.about_map):
-                worker = self._long if pending.request.takes_long else self._quick
+                worker = self._long if self._takes_long(pending.request) else self._quick
                 pending.answer = worker.submit(self._answer, pending)
                 pending.answer.add_done_callback(lambda _: self._server.wake())
+
+    def _takes_long(self, request: Request[Any]) -> bool:
+        if not isinstance(request, questions.NearestRequest) or request.class_name in STUFF_NAMES:
+            return request.takes_long
+        return not self._tracker.knows(self._mirror.snapshot())  # the things of a map that has changed are found first
 
     def _send(self, address: bytes, parts: Sequence[bytes]) -> None:
         self._server.send(address, parts)
@@ -249,6 +253,7 @@ class QueryService(Closing):
             return _encode_error(error)
         except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
             _log.exception("question_failed", question=name)
+            self._tracker = InstanceTracker()  # one that failed half way is not used again
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _find(self, snapshot: MapSnapshot, request: Request[Any]) -> object:
@@ -261,13 +266,15 @@ class QueryService(Closing):
                 return at(snapshot.with_moving(self._moving.points), request.points, request.radius_m)
             case questions.NearestRequest():
                 what = request.class_name, request.point, request.min_confidence
-                return nearest(snapshot, *what, unsure=request.unsure)
+                return nearest(snapshot, *what, unsure=request.unsure, up=request.up, tracker=self._tracker)
             case questions.RaysRequest():
                 return cast_rays(snapshot, request.origins, request.directions, request.max_m)
             case questions.BoxRequest():
                 return points_in_box(snapshot, request.lower, request.upper)
             case questions.InstancesRequest():
-                return self._find_instances(snapshot, request)
+                things = self._tracker.find(snapshot, request.up).things
+                things += self._tracker.gone if request.gone else ()
+                return tuple(thing for thing in things if request.unsure or not thing.unsure)
             case questions.OccupancyRequest():
                 return occupancy(snapshot.with_moving(self._moving.points), request.points)
             case questions.DistanceRequest():
@@ -291,18 +298,6 @@ class QueryService(Closing):
                 return self._last_pose()
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
-
-    def _find_instances(self, snapshot: MapSnapshot, request: questions.InstancesRequest) -> tuple[Instance, ...]:
-        # Out of there while it updates: one that fails half way is not used again.
-        tracker, version, things = self._tracked.pop(request.up, (None, -1, ()))
-        tracker = tracker or InstanceTracker(up=request.up)
-        if version != snapshot.version:
-            things = tracker.update(snapshot, unsure=True)
-        self._tracked[request.up] = tracker, snapshot.version, things
-        for old in list(self._tracked)[:-_MAX_TRACKERS]:
-            del self._tracked[old]
-        found = (*things, *(tracker.gone if request.gone else ()))
-        return tuple(thing for thing in found if request.unsure or not thing.unsure)
 
 
 def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:

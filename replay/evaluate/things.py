@@ -21,7 +21,6 @@ from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.imaging import resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.blocks import pack_keys
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
@@ -47,12 +46,9 @@ class ThingSurface:
         snapshot = MapMirror.of(voxel_map).snapshot()
         every = surface_voxels(snapshot)
         keys = (every.row.astype(np.int64) << 9) | every.voxel  # ascending
-        self.things = InstanceTracker(up=up).update(snapshot, unsure=True)
+        self.things, voxels, number = InstanceTracker(up=up).find(snapshot)
         self.number: NDArray[np.int64] = np.full(len(keys), -1, np.int64)
-        for index, thing in enumerate(self.things):
-            block = np.searchsorted(snapshot.packed, pack_keys(thing.voxels >> 3))
-            x, y, z = (thing.voxels & 7).T
-            self.number[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = index
+        self.number[np.searchsorted(keys, (voxels.row.astype(np.int64) << 9) | voxels.voxel)] = number
         self.xyz: Float64 = every.point * snapshot.voxel_size_m
         self._reach_m = AT_SURFACE * snapshot.voxel_size_m
 

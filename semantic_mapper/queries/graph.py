@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import PLAIN_NAMES, STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.floor_plan import find_up
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.plots import CYCLE, SMALL_PT, TITLE_PT, cut, new_figure, rendered
 from semantic_mapper.queries.checks import check_up
@@ -23,7 +22,7 @@ from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceT
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.rooms import RoomPlan, find_walls, part_rooms
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
+from semantic_mapper.queries.surface import SurfaceVoxels, surface_voxels, up_in
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 if TYPE_CHECKING:
@@ -128,7 +127,7 @@ class GraphTracker:
         ``MapError``."""
         with self._lock:
             if self._up is None:
-                self._up = find_up(surface_points(snapshot, surface_voxels(snapshot)), snapshot.label_set)
+                self._up = up_in(snapshot)
             return self._up
 
     def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:

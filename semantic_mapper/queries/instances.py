@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import weakref
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -53,6 +54,7 @@ CORE_FREE = 0.4
 GAP_M = 0.1  # pieces of another class that are no farther apart are one thing
 FLAT_M = 0.1  # of a thing that is thinner, only the better seen side of the two counts
 MAX_GONE = 64  # things that have gone, kept to be reported
+MAX_DIRECTIONS = 4  # called up, along which boxes are kept while the map is the same
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
 
 
@@ -63,6 +65,10 @@ class OrientedBox:
     center: Float64  # (3,) float64 world metres
     size: Float64  # (3,) float64 metres along its own axes: x the longer level side, y the shorter, z along up
     R_world_box: Float64  # (3, 3) float64, columns are its axes in the world
+
+    def holds(self, point: ArrayLike) -> bool:
+        """Whether a point (3,), world metres, is inside."""
+        return bool((np.abs((np.asarray(point) - self.center) @ self.R_world_box) <= self.size / 2).all())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,13 +131,23 @@ def thing_voxels(snapshot: MapSnapshot, wanted: Bool) -> ThingVoxels:
     return ThingVoxels(snapshot.packed, start, row[kept], voxel[kept], point[kept], label[kept])
 
 
-class _Found(NamedTuple):
-    """What one update has found; ``ids`` (C,) and ``sizes`` (C,) in voxels go with the components."""
+class FoundThings(NamedTuple):
+    """The things of a map, unsure ones too, and which voxels are theirs."""
 
+    things: tuple[Instance, ...]  # by ascending id
+    voxels: ThingVoxels  # of all classes of things
+    number: Int64  # (N,) int64 position in ``things`` of what each voxel belongs to; -1 = too small a piece
+
+
+class _Found(NamedTuple):
+    """What was found in a snapshot; ``ids`` (C,) and ``sizes`` (C,) in voxels go with the components."""
+
+    snapshot: weakref.ref[MapSnapshot]
     voxels: ThingVoxels
     components: Components
     ids: Int64
     sizes: Int64
+    along: dict[bytes, FoundThings]  # by the direction that was called up
 
 
 class _Whole(NamedTuple):
@@ -149,8 +165,8 @@ class InstanceTracker:
     tenth. Of several that became one, the oldest id stays; of a split, the largest part keeps the id. A thing of which
     more than half was seen through since it was whole has gone (``gone``); what is left of it gets a new id. One that
     is only no longer found has not gone. Pieces below ``min_voxels`` are left out; ``up`` (3,) is along which boxes
-    stand. Their sides run along the room's axes (the level directions that most surface of things runs along), or the
-    thing's own where it is clearly turned."""
+    stand where an update names no other. Their sides run along the room's axes (the level directions that most surface
+    of things runs along), or the thing's own where it is clearly turned. A map that has not changed costs nothing."""
 
     def __init__(self, min_voxels: int = MIN_VOXELS, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
         if min_voxels < 1:
@@ -175,48 +191,36 @@ class InstanceTracker:
         """The instances of the map as it is now, by ascending id; those that are ``unsure`` only on request.
 
         Raises MapError: lengths of the map are not metres."""
-        require_metres(snapshot.scale_known, "instances")
+        return tuple(thing for thing in self.find(snapshot).things if unsure or not thing.unsure)
+
+    def knows(self, snapshot: MapSnapshot) -> bool:
+        """Whether the things of this snapshot were found last, so that to ask again costs nothing."""
+        return self._last is not None and self._last.snapshot() is snapshot
+
+    def find(self, snapshot: MapSnapshot, up: ArrayLike | None = None) -> FoundThings:
+        """As ``update``, with the voxels of the things and with unsure ones, and boxes that stand along ``up`` (3,)."""
+        require_metres(snapshot.scale_known, "things")
+        axis = self._up if up is None else check_up(up)
+        with self._lock:
+            if self._last is None or not self.knows(snapshot):
+                self._last = self._find(snapshot)
+                self._keep_whole(snapshot, _describe(snapshot, self._last, axis).things)
+            return _describe(snapshot, self._last, axis)
+
+    def _find(self, snapshot: MapSnapshot) -> _Found:
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(STUFF_NAMES))] = True
-        with self._lock:
-            voxels = thing_voxels(snapshot, wanted)
-            found = find_things(snapshot, voxels, self._min_voxels)
-            sizes = np.diff(found.ends, prepend=0)
-            ids = np.zeros(len(sizes), np.int64)
-            if self._last:
-                self._match(self._last, voxels, found, ids)
-                self._find_gone(snapshot, ids, sizes)
-            new = np.flatnonzero(ids == 0)
-            ids[new] = self._next_id + np.arange(len(new))
-            self._next_id += len(new)
-            parts = dict(zip(ids.tolist(), np.split(found.order, found.ends[:-1]), strict=False))
-            frame = _room_frame(voxels.point[found.order] * snapshot.voxel_size_m, self._up)
-            things = [self._describe(snapshot, number, voxels, part, frame) for number, part in sorted(parts.items())]
-            self._last = _Found(voxels, found, ids, sizes)
-            self._keep_whole(snapshot, things)
-        return tuple(thing for thing in things if unsure or not thing.unsure)
-
-    def _describe(
-        self, snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64, frame: Float64
-    ) -> Instance:
-        row, voxel, labels = voxels.row[part], voxels.voxel[part].astype(np.int64), snapshot.label_set
-        slot, class_id = snapshot.slots[row].astype(np.int64), int(voxels.label[part[0]])
-        xyz, name = voxels.point[part] * snapshot.voxel_size_m, labels.names[labels.ids.index(class_id)]
-        confidence = float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS)
-        box = upright_box(xyz, frame)
-        return Instance(
-            number,
-            class_id,
-            name,
-            confidence,
-            xyz.mean(axis=0),
-            box,
-            unpack_keys(voxels.packed[row]) * 8
-            + np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1).astype(np.int32),
-            float(snapshot.measured(slot, voxel).mean()),
-            certainty_of(name, confidence, len(part) * snapshot.voxel_size_m**2),
-            float(_fraction_seen(snapshot, voxels.point[part], box)),
-        )
+        voxels = thing_voxels(snapshot, wanted)
+        found = find_things(snapshot, voxels, self._min_voxels)
+        sizes = np.diff(found.ends, prepend=0)
+        ids = np.zeros(len(sizes), np.int64)
+        if self._last:
+            self._match(self._last, voxels, found, ids)
+            self._find_gone(snapshot, ids, sizes)
+        new = np.flatnonzero(ids == 0)
+        ids[new] = self._next_id + np.arange(len(new))
+        self._next_id += len(new)
+        return _Found(weakref.ref(snapshot), voxels, found, ids, sizes, {})
 
     def _match(self, last: _Found, voxels: ThingVoxels, found: Components, ids: Int64) -> None:
         """Write the id that each component had."""
@@ -260,6 +264,34 @@ class InstanceTracker:
             known, size = before.get(thing.id), len(thing.voxels)
             most = size if known is None or 2 * size < known.most_voxels else max(size, known.most_voxels)
             self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
+
+
+def _describe(snapshot: MapSnapshot, found: _Found, up: Float64) -> FoundThings:
+    """The things that were found, with boxes that stand along ``up`` (3,)."""
+    if (key := up.tobytes()) not in found.along:
+        voxels, pieces = found.voxels, found.components
+        parts = dict(zip(found.ids.tolist(), np.split(pieces.order, pieces.ends[:-1]), strict=False))
+        frame = _room_frame(voxels.point[pieces.order] * snapshot.voxel_size_m, up)
+        things = tuple(_describe_thing(snapshot, number, voxels, part, frame) for number, part in sorted(parts.items()))
+        number = np.append(np.argsort(np.argsort(found.ids)), -1)[pieces.component]
+        if len(found.along) == MAX_DIRECTIONS:
+            found.along.clear()
+        found.along[key] = FoundThings(things, voxels, number)
+    return found.along[key]
+
+
+def _describe_thing(snapshot: MapSnapshot, number: int, voxels: ThingVoxels, part: Int64, frame: Float64) -> Instance:
+    row, voxel, labels = voxels.row[part], voxels.voxel[part].astype(np.int64), snapshot.label_set
+    slot, class_id = snapshot.slots[row].astype(np.int64), int(voxels.label[part[0]])
+    xyz, name = voxels.point[part] * snapshot.voxel_size_m, labels.names[labels.ids.index(class_id)]
+    confidence = float(snapshot.voxels.confidence[slot, voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS)
+    box = upright_box(xyz, frame)
+    place = np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1).astype(np.int32)
+    place += unpack_keys(voxels.packed[row]) * 8
+    measured = float(snapshot.measured(slot, voxel).mean())
+    certainty = certainty_of(name, confidence, len(part) * snapshot.voxel_size_m**2)
+    seen = float(_fraction_seen(snapshot, voxels.point[part], box))
+    return Instance(number, class_id, name, confidence, xyz.mean(axis=0), box, place, measured, certainty, seen)
 
 
 def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, Int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point, check_points, check_positive
-from semantic_mapper.queries.instances import LISTED, MIN_VOXELS, certainty_of, find_things, thing_voxels
+from semantic_mapper.queries.instances import FoundThings, Instance, InstanceTracker
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
@@ -27,59 +28,73 @@ class NearestSurface:
     distance_m: float  # from the point of the question
     confidence: float  # probability of the class there
     measured: bool = True  # whether a sensor measured it, or its depth was computed
+    # The thing that it belongs to, as ``instances`` has it; None of walls and the like, of pieces too small to be a
+    # thing, and where lengths are not metres.
+    thing: Instance | None = None
+
+
+_trackers: WeakKeyDictionary[MapSnapshot, InstanceTracker] = WeakKeyDictionary()
 
 
 def nearest(
-    snapshot: MapSnapshot, class_name: str, point: ArrayLike, min_confidence: float = 0.0, *, unsure: bool = False
+    snapshot: MapSnapshot,
+    class_name: str,
+    point: ArrayLike,
+    min_confidence: float = 0.0,
+    *,
+    unsure: bool = False,
+    up: ArrayLike | None = None,
+    tracker: InstanceTracker | None = None,
 ) -> NearestSurface | None:
-    """The surface point of a class that is nearest to a point (3,), world metres; ``None`` where the map has none.
+    """The surface point of a class that is nearest to a point (3,), world metres, and the thing that it is of; ``None``
+    where the map has none.
 
-    Of countable classes, only things that ``instances`` lists count; with ``unsure``, any surface. Places that are less
-    sure than ``min_confidence``, 0..1, do not count. ``LabelError``: no such class; lists those there are.
-    ``MapError``: a bad point or confidence."""
+    Of countable classes, only things that ``instances`` lists count; with ``unsure``, or where lengths are not metres,
+    any surface. Places that are less sure than ``min_confidence``, 0..1, do not count. ``tracker`` finds the things,
+    once a snapshot, and boxes stand along ``up`` (3,). ``LabelError``: no such class; lists those there are.
+    ``MapError``: a bad point, direction or confidence."""
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
     if not 0 <= min_confidence <= 1:
         raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
     least = int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
-    if not unsure and snapshot.label_set.thing_ids(STUFF_NAMES).count(class_id):
-        return _nearest_of_things(snapshot, class_name, p, least)
-    voxels, index = snapshot.voxels, snapshot.index
-    rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
-    count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, voxels.classes, rows, bounds)
-    order = np.argsort(bounds[:count], kind="stable")
-    rows, bounds = rows[order], bounds[order]
-    found = np.array((0.0, 0.0, 0.0, np.inf))
-    place = search_blocks(p, class_id, least, snapshot.packed[rows], snapshot.slots[rows], bounds, index, voxels, found)
+    found, thing = np.array((0.0, 0.0, 0.0, np.inf)), None
+    if snapshot.scale_known and class_id in snapshot.label_set.thing_ids(STUFF_NAMES):
+        tracker = tracker or _trackers.setdefault(snapshot, InstanceTracker())
+        things = tracker.find(snapshot, up)
+        place, thing = _search_things(snapshot, class_id, p, least, things, found, unsure=unsure)
+    else:
+        voxels, index = snapshot.voxels, snapshot.index
+        rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
+        count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, voxels.classes, rows, bounds)
+        order = np.argsort(bounds[:count], kind="stable")
+        blocks = rows[order]
+        near = snapshot.packed[blocks], snapshot.slots[blocks], bounds[order]
+        place = search_blocks(p, class_id, least, *near, index, voxels, found)
     if place < 0:
         return None
-    return _answer(snapshot, place, found[:3], float(found[3]))
+    size_m, confidence = snapshot.voxel_size_m, float(snapshot.voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
+    measured = bool(snapshot.voxels.weight.ravel()[place] == MEASURED)
+    return NearestSurface(found[:3] * size_m, float(np.sqrt(found[3])) * size_m, confidence, measured, thing)
 
 
-def _nearest_of_things(snapshot: MapSnapshot, class_name: str, p: Float64, least: int) -> NearestSurface | None:
-    """As ``nearest`` of a countable class, of the things that are listed; ``p`` (3,) is in units of voxels."""
-    found = thing_voxels(snapshot, np.arange(256) == snapshot.label_set.id_of(class_name))
-    pieces = find_things(snapshot, found, MIN_VOXELS)
-    place = snapshot.slots[found.row].astype(np.int64) * BLOCK_VOXELS + found.voxel
-    confidence = snapshot.voxels.confidence.ravel()[place]
-    counts = np.zeros(len(place), np.bool_)
-    for part in np.split(pieces.order, pieces.ends[:-1]) if len(pieces.ends) else ():
-        mean = float(confidence[part].mean()) / CONFIDENCE_STEPS
-        counts[part] = certainty_of(class_name, mean, len(part) * snapshot.voxel_size_m**2) >= LISTED
-    chosen = np.flatnonzero(counts & (confidence >= least))
-    if not len(chosen):
-        return None
-    squares = ((found.point[chosen] - p) ** 2).sum(axis=1)
-    best = chosen[squares.argmin()]
-    return _answer(snapshot, int(place[best]), found.point[best], float(squares.min()))
-
-
-def _answer(snapshot: MapSnapshot, place: int, point: Float64, square: float) -> NearestSurface:
-    """Of the surface point (3,) of the voxel at ``place`` of all slots, and its squared distance, in voxels."""
-    voxels, size_m = snapshot.voxels, snapshot.voxel_size_m
-    confidence = float(voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
-    measured = bool(voxels.weight.ravel()[place] == MEASURED)
-    return NearestSurface(point * size_m, float(np.sqrt(square)) * size_m, confidence, measured)
+def _search_things(
+    snapshot: MapSnapshot, class_id: int, p: Float64, least: int, things: FoundThings, found: Float64, *, unsure: bool
+) -> tuple[int, Instance | None]:
+    """As ``search_blocks`` for a countable class, and the thing there."""
+    voxels = things.voxels
+    counts = np.array([unsure or not thing.unsure for thing in things.things] + [unsure])
+    at = np.flatnonzero((voxels.label == class_id) & counts[things.number])
+    place = snapshot.slots[voxels.row[at]].astype(np.int64) * BLOCK_VOXELS + voxels.voxel[at]
+    sure = snapshot.voxels.confidence.ravel()[place] >= least
+    at, place = at[sure], place[sure]
+    if not len(at):
+        return -1, None
+    squares = ((voxels.point[at] - p) ** 2).sum(axis=1)
+    best = squares.argmin()
+    found[:] = *voxels.point[at[best]], squares[best]
+    number = things.number[at[best]]
+    return int(place[best]), things.things[number] if number >= 0 else None
 
 
 @kernel

@@ -156,12 +156,13 @@ class AtRequest(Request[PointAnswers], frozen=True, kw_only=True):
 
 
 class NearestRequest(Request[NearestSurface | None], frozen=True, kw_only=True):
-    """Where the nearest surface of a class is; see ``nearest.nearest``."""
+    """Where the nearest surface of a class is, and the thing there; see ``nearest.nearest``."""
 
     class_name: Word
     point: Point
     min_confidence: Finite = 0.0
     unsure: bool = False
+    up: Point = (0.0, 0.0, 1.0)
 
 
 class RaysRequest(Request[RayHits], frozen=True, kw_only=True):

@@ -50,7 +50,7 @@ class BlockVoxels(NamedTuple):
     classes: NDArray[np.uint64]  # (S, 4) uint64, a bit for each class id that a surface voxel of the block may have
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class MapSnapshot:
     """A map as it was at one version. Immutable, so any number of threads may query it."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,6 +75,16 @@ def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> 
     return surface_points(snapshot, SurfaceVoxels(surface.row[inside], surface.voxel[inside], surface.point[inside]))
 
 
+_ups: WeakKeyDictionary[MapSnapshot, Float64] = WeakKeyDictionary()
+
+
+def up_in(snapshot: MapSnapshot) -> Float64:
+    """Unit vector up (3,) in the world, found by the floor, once a snapshot. ``MapError`` as of ``find_up``."""
+    if snapshot not in _ups:
+        _ups[snapshot] = find_up(surface_points(snapshot, surface_voxels(snapshot)), snapshot.label_set)
+    return _ups[snapshot]
+
+
 def costmap(
     snapshot: MapSnapshot,
     radius_m: float,
@@ -88,8 +99,8 @@ def costmap(
     (3,) in the world, and ``floor_m``, the floor's height along it, are found by default. ``MapError``: a bad number;
     no metres; no floor, or nothing near it."""
     require_metres(snapshot.scale_known, "costmap")
+    axis = up_in(snapshot) if up is None else check_up(up)
     points = surface_points(snapshot, surface_voxels(snapshot))
-    axis = find_up(points, snapshot.label_set) if up is None else check_up(up)
     return occupancy_grid(points, axis, snapshot.voxel_size_m, height_m, floor_m).inflated(radius_m)
 
 

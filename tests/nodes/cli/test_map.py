@@ -121,7 +121,9 @@ def test_live_demo_runs_until_ctrl_c_while_another_terminal_asks(tmp_path: Path)
         query = running.wait_for_line("query .* nearest chair").split()[1:]
         running.wait_for_line("watch at http://127.0.0.1:")
         running.wait_for_line(r"map_saved.*frames=(2[5-9]|[3-9]\d|\d{3})\b")  # in the second loop
-        assert "found" in run_ok(*query).stdout
+        thing = json.loads(run_ok(*query, "--json").stdout)["thing"]
+        listed = json.loads(run_ok(*query[:2], "instances", "--json").stdout)["instances"]
+        assert (thing["id"], "chair") in {(other["id"], other["class"]) for other in listed}
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
         assert not any(map(is_alive, running.node_pids())) and not running.sockets().exists()

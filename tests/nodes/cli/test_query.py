@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import answer, answer_table, open_saved
+from semantic_mapper.queries import instances
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
+from tests.contract.entry_points import serving
+from tests.contract.golden import MAP
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -103,6 +107,39 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
         assert json.loads(done.stdout)["map"] == service.endpoint
         said = refused("query", service.endpoint, "nearest", "kettle", "0", "0", "0")
         assert "floor, table, cup, lamp" in said
+
+
+def test_nearest_names_the_thing_that_instances_and_the_graph_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instances, "find_things", found := Mock(wraps=instances.find_things))
+    saved, up, seen = open_saved(str(MAP)), (0.0, 0.0, 1.0), []
+    with a_folder() as folder, serving(MAP, f"ipc://{folder / 'query'}") as client:
+        for world_map in (client, saved):
+            listed = answer(world_map, "instances", up=up)["instances"]
+            objects = {thing["id"]: thing for thing in answer(world_map, "graph", up=up)["objects"]}
+            found.reset_mock()
+            for thing in listed:
+                near = answer(world_map, "nearest", thing["class"], tuple(thing["centroid"]), up=up)
+                assert near["thing"] in listed and near["thing"]["class"] == thing["class"]
+                assert near["thing"].items() <= objects[near["thing"]["id"]].items()
+                seen.append(near)
+            for name, unsure in (("wall", False), ("table", True), ("floor", True)):  # of the table there is a speck
+                seen.append(answer(world_map, "nearest", name, up, unsure=unsure))
+                assert seen[-1]["found"] and seen[-1]["thing"] is None, name
+            assert answer(world_map, "nearest", "table", up)["found"] is False
+            assert found.call_count == (world_map is saved), "once a map"
+        assert len(seen) >= 14 and seen[: len(seen) // 2] == seen[len(seen) // 2 :]
+        tilted = {thing.id: thing for thing in client.instances((0.0, 0.5, 1.0))}
+        assert tilted.keys() == {thing["id"] for thing in listed}, "an id is that of a thing, whatever is up"
+        assert all(thing.box.R_world_box[2, 2] < 0.9 for thing in tilted.values())
+    assert "none: surface alone" in run_ok("query", MAP, "nearest", "wall", "0", "0", "1").stdout
+
+
+def test_inside_a_thing_its_box_and_how_far_its_surface_is_are_said(map_file: Path) -> None:
+    inside = (*BOX[:2], BOX[2] - 0.08)
+    found, shown = ask(map_file, "at", *inside)
+    assert (found["class"], found["state"], found["measured"]) == (None, "unknown", None)
+    assert 0.05 < found["surface_distance_m"] < 0.3 and [thing["class"] for thing in found["inside"]] == ["table"]
+    assert f"inside the box of table {found['inside'][0]['id']}" in " ".join(shown.split())
 
 
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.instances import FoundThings, InstanceTracker
 from semantic_mapper.queries.nearest import at
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.questions import (
@@ -39,7 +39,7 @@ from semantic_mapper.queries.questions import (
     RaysRequest,
     encode_request,
 )
-from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.sockets import MAX_REQUEST_BYTES
 from tests.mapping.rendered_views import small_map
@@ -291,14 +291,14 @@ def test_what_moves_is_an_obstacle_while_it_is_there(endpoint: str) -> None:
 def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
     """`instances` hangs: set once it does, and to be set to let it go on."""
     hangs, may_go_on = threading.Event(), threading.Event()
-    update = InstanceTracker.update
+    find = InstanceTracker.find
 
-    def hang(self: InstanceTracker, snapshot: MapSnapshot, *, unsure: bool) -> tuple[Instance, ...]:
+    def hang(self: InstanceTracker, *about: Any) -> FoundThings:
         hangs.set()
         assert may_go_on.wait(60)
-        return update(self, snapshot, unsure=unsure)
+        return find(self, *about)
 
-    monkeypatch.setattr(InstanceTracker, "update", hang)
+    monkeypatch.setattr(InstanceTracker, "find", hang)
     yield hangs, may_go_on
     may_go_on.set()
 
@@ -359,13 +359,13 @@ def test_a_repeated_question_keeps_its_turn_and_old_ones_go(
 
 
 def test_a_bug_in_an_answer_spoils_no_later_one(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    update = InstanceTracker.update
+    find = InstanceTracker.find
 
-    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot, *, unsure: bool) -> None:
-        update(tracker, snapshot, unsure=unsure)
+    def half_way(tracker: InstanceTracker, *about: Any) -> None:
+        find(tracker, *about)
         raise KeyError("a bug")
 
-    monkeypatch.setattr(InstanceTracker, "update", half_way)
+    monkeypatch.setattr(InstanceTracker, "find", half_way)
     with pytest.raises(MapError, match="could not compute this: 'a bug'"):
         client.instances((0.5, 0.5, 1))
     monkeypatch.undo()
