@@ -82,3 +82,16 @@ os._exit(0)
     done = _python(code)
     assert done.stdout == "alive" and done.returncode == 0
     assert done.stderr.count("\n") == 1 and "first | second" in done.stderr
+
+
+def test_no_event_but_a_warning_breaks_a_bar_on_a_terminal() -> None:
+    code = """
+import structlog
+from semantic_mapper.nodes import console, process
+process.prepare_process()
+with console.frame_progress("map", 2):
+    structlog.get_logger("x").info("map_saved"), structlog.get_logger("x").warning("left_out")
+structlog.get_logger("x").info("after")
+"""
+    shown = _python(code, FORCE_COLOR="1").stderr
+    assert "map_saved" not in shown and "left_out" in shown and "after" in shown and "elapsed" in shown

@@ -8,7 +8,7 @@ import scipy
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import costmap, points_in_box, surface_voxels
+from semantic_mapper.queries.surface import costmap, points_in_box, surface_voxels, up_in
 from tests.queries.random_map import random_map, voxel_places
 from tests.queries.scene import BALL, BOX, CUP, FLOOR, TABLE, surface_of, truth_distance, whole
 
@@ -82,6 +82,7 @@ def test_points_are_all_surface_points_in_the_box() -> None:
 
 def test_a_costmap_is_the_floor_plan_without_what_is_within_the_radius_of_something() -> None:
     plain, costs = costmap(whole(), 0.0, up=(0, 0, 2)), costmap(whole(), 0.2)
+    assert up_in(whole()) is up_in(whole()), "found once a map"
     beside = BOX + np.array((0.0, 0.45, 0.0))
     assert plain.at((BOX, BALL, beside, (9, 9, 0))).tolist() == [100, 100, 0, -1]
     assert costs.at((BOX, BALL, beside, (-9, 0, 0))).tolist() == [100, 100, 99, -1] and costs.at(BOX) == [100]

@@ -45,6 +45,10 @@ def test_questions_are_answered_in_numbers_and_in_words(map_file: Path, tmp_path
     assert "table" in shown and "lamp" not in shown
     found, shown = ask(map_file, "at", *(BOX + np.array([0.0, 0.0, HALF[2]])))  # x is below zero
     assert (found["class"], found["state"]) == ("table", "occupied") and "table" in shown
+    found, shown = ask(map_file, "at", *BOX[:2], BOX[2] - 0.08)
+    assert (found["class"], found["state"], found["measured"]) == (None, "unknown", None)
+    assert 0.05 < found["surface_distance_m"] < 0.3 and [thing["class"] for thing in found["inside"]] == ["table"]
+    assert f"inside the box of table {found['inside'][0]['id']}" in " ".join(shown.split())
     found, _ = ask(map_file, "at", "-1e1", "-2", ".5")
     assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
     found, shown = ask(map_file, "nearest", "cup", *(BALL + np.array([0.0, 0.0, 1.0])))
@@ -110,36 +114,26 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
 
 
 def test_nearest_names_the_thing_that_instances_and_the_graph_list(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(instances, "find_things", found := Mock(wraps=instances.find_things))
-    saved, up, seen = open_saved(str(MAP)), (0.0, 0.0, 1.0), []
+    monkeypatch.setattr(instances, "find_things", find := Mock(wraps=instances.find_things))
+    up, seen = (0.0, 0.0, 1.0), []
     with a_folder() as folder, serving(MAP, f"ipc://{folder / 'query'}") as client:
-        for world_map in (client, saved):
+        for world_map in (client, open_saved(str(MAP))):
             listed = answer(world_map, "instances", up=up)["instances"]
             objects = {thing["id"]: thing for thing in answer(world_map, "graph", up=up)["objects"]}
-            found.reset_mock()
+            find.reset_mock()
             for thing in listed:
-                near = answer(world_map, "nearest", thing["class"], tuple(thing["centroid"]), up=up)
-                assert near["thing"] in listed and near["thing"]["class"] == thing["class"]
-                assert near["thing"].items() <= objects[near["thing"]["id"]].items()
-                seen.append(near)
+                seen.append(answer(world_map, "nearest", thing["class"], tuple(thing["centroid"]), up=up))
+                near = seen[-1]["thing"]
+                assert (
+                    near in listed and near["class"] == thing["class"] and near.items() <= objects[near["id"]].items()
+                )
             for name, unsure in (("wall", False), ("table", True), ("floor", True)):  # of the table there is a speck
                 seen.append(answer(world_map, "nearest", name, up, unsure=unsure))
                 assert seen[-1]["found"] and seen[-1]["thing"] is None, name
             assert answer(world_map, "nearest", "table", up)["found"] is False
-            assert found.call_count == (world_map is saved), "once a map"
+            assert find.call_count == (world_map is not client), "once a map"
         assert len(seen) >= 14 and seen[: len(seen) // 2] == seen[len(seen) // 2 :]
-        tilted = {thing.id: thing for thing in client.instances((0.0, 0.5, 1.0))}
-        assert tilted.keys() == {thing["id"] for thing in listed}, "an id is that of a thing, whatever is up"
-        assert all(thing.box.R_world_box[2, 2] < 0.9 for thing in tilted.values())
-    assert "none: surface alone" in run_ok("query", MAP, "nearest", "wall", "0", "0", "1").stdout
-
-
-def test_inside_a_thing_its_box_and_how_far_its_surface_is_are_said(map_file: Path) -> None:
-    inside = (*BOX[:2], BOX[2] - 0.08)
-    found, shown = ask(map_file, "at", *inside)
-    assert (found["class"], found["state"], found["measured"]) == (None, "unknown", None)
-    assert 0.05 < found["surface_distance_m"] < 0.3 and [thing["class"] for thing in found["inside"]] == ["table"]
-    assert f"inside the box of table {found['inside'][0]['id']}" in " ".join(shown.split())
+        assert {t.id for t in client.instances((0.0, 0.5, 1.0))} == {t["id"] for t in listed}, "whatever is up"
 
 
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
