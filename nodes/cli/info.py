@@ -1,4 +1,4 @@
-"""``semantic-mapper info``: what a log, a saved map or a file of boxes holds, and which weights a mapper uses."""
+"""``semantic-mapper info``: what a log, a saved map or a file of weights holds, and which weights a mapper uses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from msgspec import to_builtins
 from rich.table import Table
@@ -23,7 +22,6 @@ from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.nodes.launcher.running import LaunchView
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.run_folder import is_map, map_path
@@ -31,24 +29,21 @@ from semantic_mapper.transport.launches import STATUS_SOCKET, is_running_mapper,
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.transport.sockets import NewestSubscriber
 
-BOX_FILES = (".json", ".xml")
-
 
 @verb
 def info(
     output: JsonOutput,
-    # log (.mcap), its parts or their folder; saved map, or a folder with one; weights (.safetensors); boxes.json, JSON
-    # of `query MAP instances`, or XML of KITTI-360; `live`, ipc://PATH or tcp://HOST:PORT of a mapper
+    # log (.mcap), its parts or their folder; saved map, or a folder with one; weights (.safetensors); `live`,
+    # ipc://PATH or tcp://HOST:PORT of a mapper
     file: Annotated[list[str], typer.Argument(autocompletion=complete_launch)],
     remote: Remote,
 ) -> int:
-    """Say what a log, a map, weights or a file of boxes holds.
+    """Say what a log, a map or weights hold.
 
     Of a log (topics, frames, cameras, duration, missing frames, damage) it reads every message, so that damage
     anywhere is found; exit code 1 where there is any. Of a map (frames, size, blocks, classes) it reads what the file
     says of itself, which is quick however large the map is. Of a running mapper: what its map holds, its nodes (as
-    `view --status`, on this machine), and what became of weights that it was offered. Boxes are for `finetune --kind
-    panoptic`; any editor changes their file (docs/scenes.md).
+    `view --status`, on this machine), and what became of weights that it was offered.
 
     Example: semantic-mapper info kitchen.mcap
     Example: semantic-mapper info runs/demo
@@ -56,9 +51,7 @@ def info(
     """
     path, live = Path(file[0]), is_running_mapper(file[0])
     remote.refuse_unless(live)
-    if path.suffix.lower() in BOX_FILES:
-        found = _boxes_info(output, path)
-    elif path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
         found = _weights_file_info(output, path)
     elif live:
         found = _live_info(output, file[0], remote)
@@ -278,37 +271,3 @@ def _weights_file_info(output: Output, path: Path) -> dict[str, Any]:
         rows += [(name, f"{recipe[key] * 100:.1f} %")] if recipe.get(key) is not None else []
     output.print(table(rows, title=str(path)))
     return found
-
-
-def _boxes_info(output: Output, file: Path) -> dict[str, Any]:
-    """List the boxes of a file."""
-    found = _describe_boxes(load_boxes(file))
-    rows = [
-        (
-            *(box["id"], box["class"], box["shape"], "yes" if box["thing"] else "no"),
-            *(" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size")),
-            len(box["stamps_ns"]) or "always",
-        )
-        for box in found["boxes"]
-    ]
-    names = ("id", "class", "shape", "thing", "centre, m", "size, m", "times")
-    output.print(table(rows, names, title=str(file)))
-    return found
-
-
-def _describe_boxes(found: BoxFile) -> dict[str, Any]:
-    """The boxes as plain data, lengths in metres rounded to tenths of millimetres."""
-    listed = [
-        {
-            "id": box.id,
-            "class": box.class_name,
-            "shape": box.shape,
-            "thing": box.thing,
-            "center": np.round(box.T_world_box[:3, 3], 4).tolist(),
-            "size": np.round(box.size, 4).tolist(),
-            "stamps_ns": [stamp for stamp, _ in box.stamps or ()],
-        }
-        for box in found.primitives
-    ]
-    merge = {name: list(rest) for name, rest in found.merge.items()}
-    return {"boxes": listed, "merge": merge}

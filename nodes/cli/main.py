@@ -39,7 +39,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Use a map": {
         "query": ("query:query", "Ask a saved map, or a running mapper, what is where."),
-        "info": ("info:info", "Say what a log, a map, weights or a file of boxes holds."),
+        "info": ("info:info", "Say what a log, a map or weights hold."),
         "export": ("export:export", "Write a map, or a log, in a format of other programs."),
         "merge": ("export:merge", "Merge maps of one place into one map."),
         "scale": ("scale:scale", "Give the map of a film metres, and map it again."),

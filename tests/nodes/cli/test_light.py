@@ -42,7 +42,6 @@ LIGHT = (
     "import folder again.mcap",
     "import room.mcap clean.mcap",
     "export map.npz --out map.ply",
-    "info boxes.json",
     "keys make --keys keys",
 )
 ERRORS = (  # of what is heavy where it goes well
@@ -73,8 +72,6 @@ def assert_light(folder: Path, uses: dict[str, int]) -> None:
 def test_help_light_verbs_and_errors_load_no_heavy_package(log: Path, tmp_path: Path) -> None:
     (tmp_path / "room.mcap").symlink_to(log)
     whole_map().save(tmp_path / "map.npz")
-    box = {"id": 1, "class": "chair", "T_world_box": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
-    (tmp_path / "boxes.json").write_text(json.dumps({"boxes": [{**box, "size": [1, 1, 1]}]}))
     groups = {name: getattr(api.verb_of(name), "commands", ()) for name in VERBS}
     verbs = ["", *groups, *(f"{name} {verb}" for name, verbs in groups.items() for verb in verbs)]
     helps = {f"{verb} --help": 0 for verb in verbs}

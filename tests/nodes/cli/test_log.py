@@ -1,4 +1,4 @@
-"""``info`` of maps and boxes."""
+"""``info`` of maps."""
 
 from __future__ import annotations
 
@@ -24,14 +24,3 @@ def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["bounds_m"], [keys.min(axis=0) * 0.24, (keys.max(axis=0) + 1) * 0.24])
     assert found["label_set"] == {"name": "three", "ids": [5, 9, 2], "classes": ["table", "cup", "wall"]}
     assert found["config"]["voxel_size_m"] == 0.03 and found["size_bytes"] == path.stat().st_size
-
-
-def test_boxes_are_listed(tmp_path: Path) -> None:
-    boxes = [
-        {"id": 2, "class": "chair", "T_world_box": np.eye(4).tolist(), "size": [0.3, 0.3, 0.4]},
-        {"id": 5, "class": "wall", "T_world_box": np.eye(4).tolist(), "size": [1, 1, 2]},
-    ]
-    (file := tmp_path / "boxes.json").write_text(json.dumps({"boxes": boxes}))
-    listed = json.loads(run_ok("info", file, "--json").stdout)
-    assert [(b["id"], b["class"], b["thing"]) for b in listed["boxes"]] == [(2, "chair", True), (5, "wall", False)]
-    assert "chair" in run_ok("info", file).stdout
