@@ -30,12 +30,12 @@ from semantic_mapper.nodes.fleet.results import FleetComparison, Rows, Tables, c
 from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_SUFFIX, prepare_file
+from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.setting_docs import settings_of
 
 MAX_SHOWN = 500  # rows that are printed
 MAX_LOGS = 40
-Operation = Literal["map", "eval", "autolabel", "finetune", "refine"]
+Operation = Literal["map", "eval", "autolabel", "finetune"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,8 +56,7 @@ def _settings(ctx: typer.Context, incomplete: str) -> list[str]:
 def run(
     output: JsonOutput,
     operation: Operation,  # as the verb
-    # paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are tags). refine: maps
-    # (.npz)
+    # paths, URLs (s3, gs, http), globs in quotes, or manifests (CSV with a column `log`; others are tags)
     logs: list[str],
     *,
     out: str,  # folder or URL for the results
@@ -67,7 +66,7 @@ def run(
     address: str | None = None,  # HOST:PORT of a Ray cluster to join; without it Ray starts here, on loopback only
     cpus: Annotated[float, msgspec.Meta(ge=0.1)] = 1.0,  # CPUs of a task
     gpus: AtLeastZero = 0.0,  # GPUs of a task; views are rendered there then
-    memory: Annotated[float, msgspec.Meta(ge=0.1)] | None = None,  # GB of a task; without it 2, finetune and refine 4
+    memory: Annotated[float, msgspec.Meta(ge=0.1)] | None = None,  # GB of a task; without it 2, finetune 4
 ) -> int:
     """Do an operation with many logs, once each, and keep the results in a store.
 
@@ -79,7 +78,7 @@ def run(
     Example: semantic-mapper fleet run eval robots.csv --out s3://maps/week
     Example: semantic-mapper fleet run map logs --out runs/a --set quality=fast
     """
-    inputs = find_inputs(logs, MAP_SUFFIX if operation == "refine" else LOG_SUFFIX)  # before what is heavy
+    inputs = find_inputs(logs)  # before what is heavy
     from semantic_mapper.nodes.fleet.run import OPERATIONS, make_task, run_fleet
 
     kind = OPERATIONS[operation]

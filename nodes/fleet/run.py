@@ -40,7 +40,6 @@ from semantic_mapper.config import (
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
 from semantic_mapper.evaluation.metrics import Segments, class_sums
 from semantic_mapper.fields.checkpoint import load_checkpoint
-from semantic_mapper.fields.nesf import SMOOTHING, load_nesf
 from semantic_mapper.fields.weights import shipped_checkpoint
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
@@ -65,8 +64,7 @@ from semantic_mapper.replay.evaluate.report import write_eval_report
 from semantic_mapper.replay.evaluate_log import evaluate_log
 from semantic_mapper.replay.finetune_log import FinetuneRequest, finetune_log
 from semantic_mapper.replay.map_log import OFFLINE, replay_log
-from semantic_mapper.replay.refine_map import refine_map
-from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME
+from semantic_mapper.replay.run_folder import LOG_SUFFIX
 from semantic_mapper.replay.summary import dig, notes
 from semantic_mapper.training.config import FinetuneConfig
 
@@ -145,7 +143,7 @@ def make_task(
     settings = convert_config(data, found.settings, "--set")
     if isinstance(settings, MapperConfig):
         check_quality(given, settings.quality, "--set")
-    name, content = ("", b"") if weights is None else _read_weights(operation, weights)
+    name, content = ("", b"") if weights is None else _read_weights(weights)
     store = Store(out, create=True)
     return Task(operation, store.url, to_plain(settings), given, name, content, code_digest())
 
@@ -234,17 +232,15 @@ def _count(reference: Any, report: RunReport) -> str:
     return ""
 
 
-def _read_weights(operation: str, weights: str) -> tuple[str, bytes]:
+def _read_weights(weights: str) -> tuple[str, bytes]:
     """Name and content; no content for weights that ship."""
-    refines = operation == "refine"
-    is_file = is_url(weights) or Path(weights).is_file()
-    if not is_file and ((refines and Path(weights) == SMOOTHING) or shipped_checkpoint(Path(weights)) is not None):
+    if not is_url(weights) and not Path(weights).is_file() and shipped_checkpoint(Path(weights)) is not None:
         return weights, b""
     with tempfile.TemporaryDirectory() as folder, reaching(weights):
         local = fetch(weights, Path(folder) / _name_of(weights))
         data = local.read_bytes()
         try:
-            (load_nesf if refines else load_checkpoint)(local)
+            load_checkpoint(local)
         except WeightsError as error:
             raise WeightsError(str(error).replace(str(local), without_secrets(weights))) from error
     return local.name, data
@@ -398,14 +394,6 @@ class FinetuneSettings(FinetuneConfig, frozen=True):
     kind: Literal["", "irt", "grid"] = ""
 
 
-class RefineSettings(Config, frozen=True):
-    """Of ``refine``."""
-
-    fill: Fraction = 0.5
-    up: str = "auto"
-    by_name: bool = False
-
-
 @dataclass(frozen=True, slots=True)
 class Operation:
     """One of ``OPERATIONS``."""
@@ -476,17 +464,11 @@ def _finetune(log: Path, out: Path, weights: Path | None, settings: FinetuneSett
     return Findings(metrics=metrics, costs={"fit_s": recipe.get("seconds")}, events=events)
 
 
-def _refine(log: Path, out: Path, weights: Path | None, settings: RefineSettings) -> Findings:
-    report, _ = refine_map(log, out / MAP_NAME, weights, **to_plain(settings))
-    return Findings(metrics={name: getattr(report, name) for name in ("surface", "relabelled", "filled")})
-
-
 OPERATIONS: Mapping[str, Operation] = {
     "map": Operation(LogSettings, _map, defaults=OFFLINE),
     "eval": Operation(LogSettings, _eval),
     "autolabel": Operation(AutolabelSettings, _autolabel, defaults=OFFLINE),
     "finetune": Operation(FinetuneSettings, _finetune, memory_gb=4.0),
-    "refine": Operation(RefineSettings, _refine, memory_gb=4.0),
 }
 
 

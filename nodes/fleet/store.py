@@ -28,7 +28,7 @@ import msgspec
 from semantic_mapper.errors import ConfigError, DependencyError, FleetError, SemanticMapperError, StoreError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.replay.run_folder import STORE_MARK
+from semantic_mapper.replay.run_folder import LOG_SUFFIX, STORE_MARK
 
 _SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
 _MARK_CONTENT = b'{"format": "semantic-mapper-fleet", "version": 3}\n'
@@ -69,7 +69,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     # digest of all that decides a result: operation, content of the log, weights, settings, code. Of a failure: of
     # operation, URL, weights and settings.
     key: str
-    operation: str  # "map", "eval", "autolabel", "finetune" or "refine"
+    operation: str  # "map", "eval", "autolabel" or "finetune"
     log: str  # URL of the log, without credentials
     tags: dict[str, str]  # of the manifest, such as robot, site and date
     version: str  # of the code, for people
@@ -304,7 +304,7 @@ class LogInput(msgspec.Struct, frozen=True):
     tags: dict[str, str] = {}  # what a manifest says of it, such as robot, site and date
 
 
-def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
+def find_inputs(arguments: Sequence[str]) -> list[LogInput]:
     """Every log that is meant, once each, in the order of the arguments.
 
     A glob stands for the files that it matches (``site/*.mcap``) or, with a slash at its end, for folders
@@ -316,7 +316,7 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
     found: dict[str, LogInput] = {}
     for argument in arguments:
         is_manifest = argument.lower().endswith(".csv")
-        for item in _read_manifest(argument) if is_manifest else map(LogInput, _expand(argument, suffix)):
+        for item in _read_manifest(argument) if is_manifest else map(LogInput, _expand(argument)):
             if item.tags or item.url not in found:
                 found[item.url] = item
     if not found:
@@ -324,12 +324,12 @@ def find_inputs(arguments: Sequence[str], suffix: str) -> list[LogInput]:
     return list(found.values())
 
 
-def _expand(argument: str, suffix: str) -> list[str]:
+def _expand(argument: str) -> list[str]:
     fs, path = open_url(argument)
     if not is_url(argument) and os.path.exists(path):  # letters of globs may stand in names
         return [path]
     if re.search(r"[*?[]", path) and not argument.startswith(("http://", "https://")):
-        wanted, ending = ("directory", "") if argument.endswith("/") else ("file", suffix)
+        wanted, ending = ("directory", "") if argument.endswith("/") else ("file", LOG_SUFFIX)
         with reaching(argument):
             matches = fs.glob(path, detail=True)
         names = [name for name, info in matches.items() if info["type"] == wanted and name.lower().endswith(ending)]

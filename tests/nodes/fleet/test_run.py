@@ -86,11 +86,6 @@ def test_operations_leave_their_files_and_figures(
         assert found.findings.metrics["miou"] == found.findings.metrics["miou sray"]
 
 
-def test_refine_takes_maps(tmp_path: Path, replayed: Path) -> None:
-    found = done(task_of("refine", tmp_path, Path("smoothed"), None, "up=z"), replayed / "map.npz")
-    assert set(found.files) == {"map.npz"} and (found.findings.metrics["surface"] or 0) > 0
-
-
 def test_what_a_worker_cannot_do_says_why(tmp_path: Path, log: Path, weights: Path) -> None:
     task = task_of("map", tmp_path / "store", weights)
     for changes, url, error, why in (

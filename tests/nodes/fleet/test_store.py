@@ -72,9 +72,9 @@ def test_a_manifest_and_globs_are_read_from_a_bucket(bucket: str) -> None:
     files.pipe_file("results/fleet.csv", b"log,robot\nsite/a.mcap,r1\n")
     for name in "ab":
         files.pipe_file(f"results/site/{name}.mcap", b"a")
-    (tagged,) = find_inputs(["s3://results/fleet.csv"], ".mcap")
+    (tagged,) = find_inputs(["s3://results/fleet.csv"])
     assert (tagged.url, tagged.tags) == ("s3://results/site/a.mcap", {"robot": "r1"})
-    found = find_inputs(["s3://results/site/*.mcap"], ".mcap")
+    found = find_inputs(["s3://results/site/*.mcap"])
     assert [item.url for item in found] == ["s3://results/site/a.mcap", "s3://results/site/b.mcap"]
     with pytest.raises(StoreError, match="s3://no-such-bucket/fleet") as caught:
         Store("s3://no-such-bucket/fleet", create=True)

@@ -56,20 +56,20 @@ def test_names_globs_folders_and_manifests_are_logs_once_each(logs: Path) -> Non
         (["c[1].mcap"], ["c[1].mcap"]),
         (["a.mcap", "[ab].mcap"], ["a.mcap", "b.mcap"]),
     ):
-        inputs = find_inputs([f"{logs}/{name}" for name in names], ".mcap")
+        inputs = find_inputs([f"{logs}/{name}" for name in names])
         assert [Path(item.url).name for item in inputs] == found
     (logs / "fleet.csv").write_text("log,robot,site\na.mcap,r1,north\nrun,r2,\n", encoding="utf-8")
-    first, second = find_inputs([str(logs / "a.mcap"), str(logs / "fleet.csv")], ".mcap")
+    first, second = find_inputs([str(logs / "a.mcap"), str(logs / "fleet.csv")])
     assert first.url == str(logs / "a.mcap") and first.tags == {"robot": "r1", "site": "north"}
     assert second.url == str(logs / "run") and second.tags == {"robot": "r2"}
-    (signed,) = find_inputs(["https://host/a.mcap?X-Amz-Signature=1"], ".mcap")
+    (signed,) = find_inputs(["https://host/a.mcap?X-Amz-Signature=1"])
     assert signed.url == "https://host/a.mcap?X-Amz-Signature=1", "no glob"
 
 
 def test_what_is_no_log_and_a_manifest_that_cannot_be_used_are_refused(logs: Path) -> None:
     for name, why in (("c.mcap", "no such log"), ("d*.mcap", "matches no file"), ("c*/", "matches no directory")):
         with pytest.raises(ConfigError, match=why):
-            find_inputs([f"{logs}/{name}"], ".mcap")
+            find_inputs([f"{logs}/{name}"])
     for text, why in (
         ("path,robot\na.mcap,r1\n", "in the column 'log'"),
         ("log,robot\n,r1\n", "line 2 must have a path"),
@@ -79,4 +79,4 @@ def test_what_is_no_log_and_a_manifest_that_cannot_be_used_are_refused(logs: Pat
     ):
         (logs / "fleet.csv").write_text(text, encoding="latin-1")
         with pytest.raises(ConfigError, match=why):
-            find_inputs([str(logs / "fleet.csv")], ".mcap")
+            find_inputs([str(logs / "fleet.csv")])
