@@ -37,11 +37,12 @@ def bench(
     log = log or demo_log()
     if part == "fusion":
         found = bench_fusion(log, frames)
-        output.print(
-            f"fusion of 640x480 into {found['voxel_size_m'] * 100:g} cm voxels: Open3D {found['open3d_ms']} ms a frame "
-            f"without classes, ours {found['ms_20']} ms with 20 ({found['ratio_20']} times) and {found['ms_40']} ms "
-            f"with 40 ({found['ratio_40']} times)"
+        ours = ", ".join(
+            f"ours {found[f'ms_{n}']} ms with {n} ({middle} times; {low} to {high} in {found['repeats']} repeats)"
+            for n, (middle, low, high) in ((n, found[f"ratio_{n}"]) for n in (20, 40))
         )
+        voxels = f"{found['voxel_size_m'] * 100:g} cm voxels"
+        output.print(f"fusion of 640x480 into {voxels}: Open3D {found['open3d_ms']} ms a frame without classes, {ours}")
     else:
         found = bench_pipeline(log, weights, mapper.load(), frames)
         stages = ", ".join(f"{name} {value}" for name, value in found["stages_ms"].items())
