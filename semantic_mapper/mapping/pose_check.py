@@ -9,9 +9,8 @@ pixels. Where the poses jump or drift, only the pairs across the jump do: so the
 compared, too, and a tenth of the pairs is enough for a warning. What moves is seen through between neighbours in time
 as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 10 % too long, a drift of 20 cm.
 
-Poses that stand still give no pairs: there, pictures may not show one view after the other. Two are one view where a
-quarter of the parts with texture correlate: above 0.99 for a still camera, whoever walks before it; in a recording of a
-kitchen 0.3 after a second and a half."""
+Poses that stand still give no pairs, and pictures may not show one view after the other. A quarter of the parts of a
+still camera's pictures correlate by 0.99, whoever walks before it; in a walk through a kitchen 0.3 after 1.5 s."""
 
 from __future__ import annotations
 
@@ -87,8 +86,7 @@ class PoseCheck:
         self._limit_m = FAR * depth_max_m
         self._newest: deque[float] = deque(maxlen=WINDOW)
         self._pairs: deque[float] = deque(maxlen=PAIR_WINDOW)
-        # By camera: a pose at which it stands still, the frame that was the first there, and what it has shown there.
-        self._places: dict[str, tuple[Float64, int, list[Float32]]] = {}
+        self._places: dict[str, tuple[Float64, int, list[Float32]]] = {}  # camera -> pose, since which frame, views
         self._frames = 0
         self._moving: dict[tuple[str, int], float] = {}  # keyframe -> fraction seen through against the one before it
         self.compared = 0
@@ -124,9 +122,8 @@ class PoseCheck:
         self._places[frame.camera_id] = pose, since, [*views, new][: known + 1]
         if known + 1 >= STILL_VIEWS:
             self.warning = (
-                f"poses stand still while the camera moves: pictures show {STILL_VIEWS} different views at one pose, "
-                f"found at frame seq={frame.seq}: the map cannot be trusted. Check that each frame has a pose of its "
-                "own, and that what gives the poses had not lost track"
+                f"poses stand still while the camera moves: {STILL_VIEWS} different views at one pose up to frame "
+                f"seq={frame.seq}: the map cannot be trusted. Check that each frame has its own pose (lost tracking?)"
             )
             _log.warning("poses_stand_still", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
 
@@ -218,21 +215,18 @@ def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | N
 
 
 def _view_of(rgb: UInt8) -> Float32:
-    """Parts of a picture (H, W, 3), (parts, pixels) float32 grey, without their mean."""
-    small = cv2.resize(rgb, _SIZE, interpolation=cv2.INTER_AREA)
-    gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.float32)
-    parts = gray.reshape(_PARTS).swapaxes(1, 2).reshape(_PARTS[0] * _PARTS[2], -1)
-    return parts - parts.mean(axis=1, keepdims=True)
+    """Parts of a picture (H, W, 3), (parts, pixels) grey without their mean, of length 1, or 0 without texture."""
+    gray = cv2.cvtColor(cv2.resize(rgb, _SIZE, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    parts = gray.reshape(_PARTS).swapaxes(1, 2).reshape(_PARTS[0] * _PARTS[2], -1).astype(np.float32)
+    parts -= parts.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(parts, axis=1, keepdims=True)
+    return np.where(length > _TEXTURED * parts.shape[1] ** 0.5, parts / np.maximum(length, 1), 0)
 
 
 def _is_same_view(a: Float32, b: Float32) -> bool:
     """Whether a quarter of the parts with texture correlate; True where there are too few of them to tell."""
-    spread = np.sqrt((a * a).mean(axis=1)), np.sqrt((b * b).mean(axis=1))
-    textured = np.maximum(*spread) > _TEXTURED
-    if textured.sum() < len(a) / 4:
-        return True
-    correlation = (a * b).mean(axis=1)[textured] / np.maximum(spread[0] * spread[1], 1e-6)[textured]
-    return float(np.percentile(correlation, 75)) > SAME_VIEW
+    correlation = (a * b).sum(axis=1)[(a.any(axis=1) | b.any(axis=1))]
+    return len(correlation) < len(a) / 4 or bool(np.percentile(correlation, 75) > SAME_VIEW)
 
 
 def _oldest_neighbours(new: Keyframe, keyframes: Sequence[Keyframe], but: Sequence[Keyframe]) -> list[Keyframe]:
