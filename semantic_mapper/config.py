@@ -358,13 +358,8 @@ def with_quality(config: MapperConfig) -> MapperConfig:
 
 
 def check_quality(data: Mapping[str, Any], quality: Quality, where: str) -> None:
-    """Refuse what a file says of settings that a quality sets otherwise: one of the two would be without effect.
-
-    Raises ConfigError: names the settings.
-
-    Args:
-        data: The mapper's config as the file ``where`` has it, of the right form.
-        quality: In force, whether the file asks for it or somebody else.
+    """Refuse what the file ``where`` says, ``data`` of the right form, of settings that the quality in force sets
+    otherwise: one of the two would be without effect. Raises ConfigError: names the settings.
     """
     if quality not in QUALITIES:  # "custom"; what is not valid at all is refused with the other settings
         return
@@ -589,8 +584,7 @@ def nearest(wrong: str, valid: Sequence[str]) -> str:
 
 
 def nearest_path(path: Path) -> str:
-    """How a message about a file or folder that is missing ends: with the one whose name is nearest; empty where none
-    is."""
+    """How a message about a path that is missing ends: with the one whose name is nearest, if any is near."""
     with suppress(OSError, ValueError):  # a folder that cannot be listed; nothing is missing
         *_, wrong = (part for part in (path, *path.parents) if not part.exists())
         near = difflib.get_close_matches(wrong.name, sorted(p.name for p in wrong.parent.iterdir()), n=1)

@@ -41,16 +41,12 @@ def merge_maps(
 ) -> MergeReport:
     """Fuse saved maps; at most two are loaded at a time, each within ``MEMORY_MB``.
 
-    The first map and those with a given pose are added in their order. Each other one is found by the places it shares
-    with what was merged so far; found maps help to find others.
+    The first map and those with a given T_world_map (4, 4) are added in their order; the first one is the world where
+    none has any. Each other one is found by the places it shares with what was merged so far; found maps help to find
+    others. ``sources`` are those of ``find_maps``; ``on_added`` is called after each.
 
     Raises ConfigError: a pose of no map. MapError: maps that do not fit each other, are the same, have seen the same
     frames, or fit nowhere; or a map cannot be read. StoreError: a map cannot be fetched.
-
-    Args:
-        sources: Of ``find_maps``.
-        given: T_world_map (4, 4) float64 by name. Without any, the world is that of the first map.
-        on_added: Called after each map.
     """
     names = list(sources)
     if unknown := sorted(set(given) - set(names)):

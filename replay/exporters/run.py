@@ -54,19 +54,13 @@ def export_log(
     max_frames: int = 0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> LogExportReport:
-    """Write the frames of a log; ``out`` is there only once it is whole.
+    """Write the frames of a log, at most ``max_frames`` (0 = all), to a file or folder that is there only once it is
+    whole; those of one ``camera``, without which a trajectory, tum or folder refuses a log of several. Damaged frames
+    are passed over and stand in the ``errors`` of the log. ``on_frame`` is called for each frame that was looked at.
 
     Raises ConfigError: a camera that is not in the log, or several where the format holds one. MapError: the format
     states metres, and the log has none. LogError: ``out`` is there already (a file that is no log is replaced), or
     cannot be written; or no frame could be.
-
-    Args:
-        log: To read; damaged frames are passed over and stand in its ``errors``.
-        out: File or folder to make.
-        name: The format.
-        camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
-        max_frames: Stop after this many; 0 = all.
-        on_frame: Called for each frame that was looked at.
     """
     if name == "tum":
         require_metres(log.info.scale_known, f"{out}: depth and poses of a TUM sequence are in metres")

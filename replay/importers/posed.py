@@ -76,20 +76,12 @@ class LoadedFrame:
 
 
 class PosedPictures:
-    """The pictures of a recording; ``load`` may be called in any order.
+    """The pictures of a recording, in the order of their times where each has one; ``load`` may be called in any order.
 
-    Raises ImportSourceError: there is no picture. LabelError: a class to rename that the recording does not have.
-
-    Args:
-        source: What the log names as its source.
-        pictures: In their order; where each has a time, in that of the times.
-        options, depth_scale, notices: See ``ImportOptions``, ``DepthScale``, ``ImportReport``.
-        scale_from: What gives lengths in metres, where an error of it would scale the map; or ``SCALE_UNKNOWN``.
-        hz: About the rate of the pictures.
-        labels: Classes of the label images; None = no labels.
-        read_depth: Reads the depth image of a picture, in metres and in the pixels of its rectified image; None = by
-            ``depth_scale``, where its file is there.
-        read_rgb, read_label: As those of ``base``.
+    ``scale_from`` says what gives metres, where an error of it would scale the map; or it is ``SCALE_UNKNOWN``.
+    ``read_depth`` reads depth in metres and in the pixels of the rectified picture; by default it goes by
+    ``depth_scale``, where the file is there. ``read_rgb`` and ``read_label`` are as those of ``base``. Raises
+    ImportSourceError: there is no picture. LabelError: a class to rename that the recording does not have.
     """
 
     def __init__(

@@ -208,15 +208,8 @@ def import_recording(
     Images that are JPEG or PNG files stay what they are, and depth loses nothing. A frame that cannot be used is left
     out and reported; a bad label image costs the frame its label only. Raises ImportSourceError: not such a recording,
     or not one good frame in it. LabelError: a class to rename that the recording does not have. LogError: ``dst`` is
-    there already, or cannot be written.
-
-    Args:
-        src: Folder of the recording, or its file.
-        dst: Log to write.
-        format_name: One of ``FORMATS``; None = found out.
-        on_progress: Called with (frames looked at, frames in all).
-        options: How to read.
-        overwrite: Whether a log that is there may be replaced.
+    there already, or cannot be written. The format is found out where ``format_name``, one of ``FORMATS``, is None;
+    ``on_progress`` is called with (frames looked at, frames in all).
     """
     if dst.exists() and not overwrite:
         raise LogError(f"{dst}: exists already; choose another name, or --overwrite it")

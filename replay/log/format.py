@@ -76,16 +76,10 @@ _DEFAULTS = CodecOptions()
 
 
 class LogWriter:
-    """Writes a log. A context manager; not for several threads at once.
+    """Writes a log. A context manager; not for several threads at once. ``options`` are those of ``write_frame``,
+    lossless by default; errors call the file ``named``, where it has another name until it is whole.
 
     Raises LogError: the file exists, or cannot be written; then no file is left.
-
-    Args:
-        path: Of the new file.
-        info: What the stream is.
-        options: How ``write_frame`` packs; lossless by default.
-        attachments: What else to keep in it.
-        named: How errors call the file, where it has another name until it is whole.
     """
 
     def __init__(
@@ -142,13 +136,9 @@ class LogWriter:
             self._file.commit()
 
     def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
-        """Append one frame.
+        """Append one frame; ``encoded_rgb`` is a PNG or JPEG file that decodes to its ``rgb``, kept as it is.
 
         Raises CodecError: the frame cannot be packed; the log is as it was. LogError: the disk is full or gone.
-
-        Args:
-            frame: With a finite pose.
-            encoded_rgb: A PNG or JPEG file that decodes to ``frame.rgb``, kept as it is.
         """
         self.write_parts(encode_frame(frame, self._options, encoded_rgb=encoded_rgb))
 

@@ -118,14 +118,10 @@ def _walk(fd: int, size: int) -> Scan:
 
 
 def read_payloads(fd: int, place: Place, most: int | None = None) -> list[bytes]:
-    """Data of the messages of one chunk, or of a message outside chunks.
+    """Data of the messages of one chunk, or of a message outside chunks; with ``most`` only so many bytes of each, and
+    the chunk's checksum is not checked.
 
     Raises LogError: damaged, beyond the limits of a chunk, or the disk fails; says not where.
-
-    Args:
-        fd: Of the file.
-        place: Of the record.
-        most: Only so many bytes of each message, without checking the chunk's checksum; None = all.
     """
     start, size = place
     try:

@@ -70,15 +70,9 @@ def play(
 
     A frame that cannot be read or decoded is passed over and stands in the report; the rest is played. Raises
     NodeError: lockstep, and the mapper has gone or does not answer. ``EndOfStream`` has been sent then too.
-    TransportError: no subscriber came, or one does not keep up.
-
-    Args:
-        log: To play.
-        publisher: Policy "block" where nothing may be lost.
-        acks: The mapper's answers; needed for lockstep. Subscribe to ``ACK_TOPICS`` of the mapper.
-        options: See ``PlayOptions``.
-        stop: Ends the playing early when set.
-        on_frame: Called with each frame sent, in lockstep once the mapper has answered it.
+    TransportError: no subscriber came, or one does not keep up. The policy of ``publisher`` is "block" where nothing
+    may be lost. Lockstep needs ``acks``, which subscribe to ``ACK_TOPICS`` of the mapper. ``stop`` ends the playing
+    early. ``on_frame`` is called with each frame sent, in lockstep once the mapper has answered it.
     """
     options, stop = options or PlayOptions(), stop or threading.Event()
     if options.mode == "lockstep" and acks is None:

@@ -145,13 +145,8 @@ class Recording:
                 return
 
     def announce(self, info: Parts, attachment: LogAttachment) -> None:
-        """Append what a further stream is; like the first one's it stands in each part that begins from now on.
-
-        Raises CodecError: not a message of ours; the recording is as it was.
-
-        Args:
-            info: The message.
-            attachment: Takes the place of the one of its name.
+        """Append what a further stream is; like the first one's it stands in each part that begins from now on, and the
+        attachment in the place of the one of its name. Raises CodecError: not a message of ours; nothing has changed.
         """
         self._others.append(info)  # first: where there is no room now, it stands in the next part
         self._attachments = (*(kept for kept in self._attachments if kept.name != attachment.name), attachment)

@@ -20,14 +20,8 @@ def open_log(
     on_error: Callable[[LogError], None] = lambda error: None,
     allow_empty: bool = False,
 ) -> LogReader:
-    """Open a log, or the parts of a recording as one.
-
-    Raises LogError: see ``LogReader``; or a folder without logs.
-
-    Args:
-        paths: A file (that log alone), several (the parts of one recording, in any order), or a folder: all logs in it.
-        on_error: Called with each error as it is found.
-        allow_empty: Open one without frames too.
+    """Open a log, or the parts of a recording as one: a file (that log alone), several (parts in any order), or a
+    folder (all logs in it). See ``LogReader``, also for errors; LogError: a folder without logs.
     """
     named = [Path(paths)] if isinstance(paths, str | Path) else list(paths)
     files: list[Path] = []

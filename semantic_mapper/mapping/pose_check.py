@@ -48,8 +48,7 @@ STEP = 3  # every n rows and columns of a keyframe's small depth image
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # T_body_camera
 STILL_M, STILL_DEG = 1e-3, 0.1  # that a pose which stands still may change by
-STILL_VIEWS = 6  # different ones at one pose, none of which comes back, contradict it ...
-STILL_FRAMES = 600  # ... among so many frames: a place changes in the end
+STILL_VIEWS, STILL_FRAMES = 6, 600  # different views at one pose that contradict it, and frames among which they are
 SAME_VIEW = 0.5  # correlation from which on parts of two pictures show the same
 _SIZE, _PARTS = (
     (80, 60),

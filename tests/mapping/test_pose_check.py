@@ -136,15 +136,11 @@ def test_what_moves_in_a_third_of_the_picture_raises_no_warning() -> None:
     assert poses.compared > MIN_KEYFRAMES and not poses.warning
 
 
-def at_one_pose(frame: PosedFrame) -> PosedFrame:
-    return replace(frame, T_world_camera=np.eye(4))
-
-
 def test_poses_that_stand_still_while_pictures_do_not_are_reported_once_without_depth_too() -> None:
     poses = PoseCheck(5.0)
     with capture_logs() as logs:
         for frame in room():
-            poses.look(replace(at_one_pose(frame), depth_m=None))
+            poses.look(replace(frame, T_world_camera=np.eye(4), depth_m=None))
     assert "poses stand still" in poses.warning
     assert [entry["event"] for entry in logs] == ["poses_stand_still"]
 
@@ -160,7 +156,7 @@ def test_a_camera_that_stands_still_raises_no_warning(passes: str) -> None:
         if passes == "a light":
             rgb *= 1 - 0.5 * (number // 7 % 2)
         noisy = np.clip(rgb + rng.normal(0, 5, rgb.shape), 0, 255).astype(np.uint8)
-        poses.look(replace(at_one_pose(still), rgb=noisy))
+        poses.look(replace(still, rgb=noisy))
     assert not poses.warning
 
 
