@@ -78,19 +78,20 @@ def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
     """What became of a run, what to know of it, and where its pictures and its map are, a line each; the report has
     the other figures."""
     ms, unknown, scored = (dig(summary, path) for path in ("latency_ms.p50", "map.unknown", "metrics.miou"))
+    mapped = f"{summary['frames']['fused']} of {counted(summary['frames']['published'], 'frame')}"
+    times = "" if ms is None else f", {_ms(ms)} each (p95 {_ms(dig(summary, 'latency_ms.p95'))})"
+    known = [f"{percent(unknown)} unknown"] if unknown else []
+    if scored is not None:
+        known.append(f"{percent(scored)} mIoU, {percent(dig(summary, 'metrics.total_accuracy'))} of pixels right")
     lines = [
-        f"{summary['frames']['fused']} of {counted(summary['frames']['published'], 'frame')} mapped by "
-        f"{dig(summary, 'weights.file')}"
-        + ("" if ms is None else f", {_ms(ms)} a frame (p95 {_ms(dig(summary, 'latency_ms.p95'))})"),
-        f"{dig(summary, 'map.surface_points'):,} surface points in voxels of {_voxel_size(summary)}"
-        + (f", {percent(unknown)} of an unknown class" if unknown else ""),
+        f"{mapped} of {summary['source']} mapped{times}",
+        f"{dig(summary, 'map.surface_points'):,} surface points in voxels of {_voxel_size(summary)}",
+        f"classes by {dig(summary, 'weights.file')}{': ' if known else ''}{'; '.join(known)}",
     ]
     if (disagreement := dig(summary, "pose_check.depth_disagreement")) is not None:
         lines.append(f"poses and depth disagree in {percent(disagreement)} of what two frames see")
     if scene := summary.get("scene"):
         lines.append(f"known to the weights: {_scene_known(scene)}")
-    if scored is not None:
-        lines.append(f"{percent(scored)} mIoU, {percent(dig(summary, 'metrics.total_accuracy'))} of the pixels right")
     lines += notes(summary)
     for names, text in _RESULTS.items():
         if there := [name for name in names if (out / name).exists()]:

@@ -90,10 +90,10 @@ def query(
 ) -> int:
     """Ask a saved map, or a running mapper, what is where.
 
-    info: size and classes. at X Y Z: class at a point, and whether it is free, occupied or unknown. nearest CLASS X
-    Y Z: the nearest thing or surface of a class. instances: countable things with upright boxes, certainty and the
-    fraction seen. graph: floors, rooms, doors, and things by room. relocalize LOG: find frames with measured depth in
-    a saved map; exit code 1 where they do not agree.
+    info: size and classes. at X Y Z: class at a point, whose box it is in, and whether it is free, occupied or
+    unknown. nearest CLASS X Y Z: the nearest surface of a class, and its thing. instances: countable things with
+    upright boxes, certainty and the fraction seen. graph: floors, rooms, doors, and things by room. relocalize LOG:
+    find frames with measured depth in a saved map; exit code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1

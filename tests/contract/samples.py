@@ -174,7 +174,7 @@ def answers() -> dict[str, Any]:
     return {
         "info": MapInfo("m1", 7, 1, 9, 0.05, 4.0, LABELS),
         "at": PointAnswers(u8, f4, f4[::-1], u8 % 3, measured),
-        "nearest": NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75, thing=thing),
+        "nearest": NearestSurface(np.array((0.1, 0.2, 1 / 3)), 0.5, 0.75),
         "cast_rays": RayHits(far, u8, f4, rgb, measured),
         "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
         "instances": (thing,),
