@@ -28,9 +28,7 @@ class NearestSurface:
     distance_m: float  # from the point of the question
     confidence: float  # probability of the class there
     measured: bool = True  # whether a sensor measured it, or its depth was computed
-    # The thing that it belongs to, as ``instances`` has it; None of walls and the like, of pieces too small to be a
-    # thing, and where lengths are not metres.
-    thing: Instance | None = None
+    thing: Instance | None = None  # that it is of; None = of none, such as a wall or a speck, or there are no metres
 
 
 _trackers: WeakKeyDictionary[MapSnapshot, InstanceTracker] = WeakKeyDictionary()
