@@ -35,7 +35,7 @@ CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
-FOCAL = 1.06 / np.tan(np.deg2rad(55) / 2)  # Rerun's, with a margin; in halves of a view's height, its least width
+FOCAL = 1.12 / np.tan(np.deg2rad(55) / 2)  # Rerun's, with a margin; in halves of a view's height, its least width
 _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 

@@ -44,7 +44,7 @@ def test_the_first_look_is_from_above_into_a_room_without_its_ceiling(ceiling: b
     axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(ahead, right), ahead)]
     x, y, z = axes @ (xyz[~hidden] - eye.position).T
     out = np.maximum(abs(x), abs(y)) / z / np.tan(np.deg2rad(55 / 2))  # 1 = at the edge of a view that is square
-    assert np.percentile(out, 99) > 0.9 and out.max() < 1.02
+    assert np.percentile(out, 99) > 0.85 and out.max() < 1.02
 
 
 def test_what_moves_is_shown_where_it_was_seen() -> None:
