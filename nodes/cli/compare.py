@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import filecmp
 from pathlib import Path
 
 from semantic_mapper.config import AtLeastZero
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, verb, wrong_usage
-from semantic_mapper.replay.compare import Difference, Tolerances, compare_runs, read_run
-from semantic_mapper.replay.run_folder import map_path
+from semantic_mapper.replay.compare import Tolerances, compare_runs, read_run
 
 _DEFAULT = Tolerances()
 
@@ -23,7 +21,6 @@ def compare(
     score: AtLeastZero = _DEFAULT.score,  # allowed of mIoU and accuracies
     surface_m: AtLeastZero = _DEFAULT.surface_m,  # allowed distance of the surfaces, metres
     labels: AtLeastZero = _DEFAULT.labels,  # allowed fraction of points with another class
-    exact: bool = False,  # the maps must be the same, byte for byte
 ) -> int:
     """Compare two results of one log: scores and surfaces.
 
@@ -31,14 +28,10 @@ def compare(
 
     Example: semantic-mapper compare runs/before runs/after
     Example: semantic-mapper compare runs/before runs/after --labels 0.05
-    Example: semantic-mapper compare a/map.npz b/map.npz --exact --json
     """
     tolerances = Tolerances(score=score, surface_m=surface_m, labels=labels)
     with wrong_usage(SemanticMapperError):
         comparison = compare_runs(read_run(a), read_run(b), tolerances)
-        if exact:
-            other = 0 if filecmp.cmp(map_path(a), map_path(b), shallow=False) else 1
-            comparison.figures.append(Difference("other bytes", None, None, other))
     for line in (*comparison.figures, *comparison.notes):
         output.print(str(line))
     different = ", ".join(figure.name for figure in comparison.differences)

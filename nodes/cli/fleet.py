@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv as csv_files
-import io
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +11,6 @@ from rich.table import Table
 
 from semantic_mapper.config import AtLeastZero, MapperConfig
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.files import write_bytes
 from semantic_mapper.nodes.cli.verb import (
     EXIT_FAILED,
     JsonOutput,
@@ -30,7 +27,6 @@ from semantic_mapper.nodes.fleet.results import FleetComparison, Rows, Tables, c
 from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
-from semantic_mapper.replay.run_folder import prepare_file
 from semantic_mapper.setting_docs import settings_of
 
 MAX_SHOWN = 500  # rows that are printed
@@ -118,8 +114,6 @@ def table(
     store: str,  # path or URL of a store, as `fleet run --out` has written it
     query: str
     | None = None,  # columns of `logs`, such as "log, miou", or a SELECT on logs, classes, events and failures
-    *,
-    csv: Path | None = None,  # write all rows to this file, as CSV
 ) -> None:
     """Query the results of a fleet with SQL (DuckDB); without a query, show an overview and the columns.
 
@@ -127,22 +121,15 @@ def table(
     `events` belong to a row of `logs` by `key`; `failures` has a row for each log that failed.
 
     Example: semantic-mapper fleet table runs/fleet
-    Example: semantic-mapper fleet table runs/fleet "log, miou" --csv miou.csv
+    Example: semantic-mapper fleet table runs/fleet "log, miou" --json
     Example: semantic-mapper fleet table runs/fleet "SELECT * FROM failures"
     """
     tables = Tables(Store(store))
     rows = tables.overview() if query is None else tables.query(query)
     plain: Any = [dict(zip(rows.names, row, strict=True)) for row in rows.values]
-    if csv is not None:
-        prepare_file(csv)
-        text = io.StringIO(newline="")
-        csv_files.writer(text).writerows([rows.names, *rows.values])
-        write_bytes(csv, text.getvalue().encode())
-        output.print(f"{counted(len(rows.values), 'row')} written to {csv}")
-    else:
-        output.print(_shown(rows))
-        if len(rows.values) > MAX_SHOWN:
-            output.print(f"{len(rows.values) - MAX_SHOWN} more rows; --csv and --json give all")
+    output.print(_shown(rows))
+    if len(rows.values) > MAX_SHOWN:
+        output.print(f"{len(rows.values) - MAX_SHOWN} more rows; --json gives all")
     if query is None:
         plain = {"overview": plain, "columns": tables.columns()}
         for name, columns in tables.columns().items():
@@ -161,10 +148,6 @@ def compare(
     metric: str = "miou",  # miou, "miou METHOD", iou:CLASS, or another metric or cost
     threshold: AtLeastZero = 0.0,  # allowed loss of the mean over logs, in units of the metric
     log_threshold: AtLeastZero = 0.02,  # allowed loss of a single log
-    lower_is_better: Annotated[
-        bool | None,
-        typer.Option("--lower-is-better/--higher-is-better", help="Of the metric.  [default: as declared for it]"),
-    ] = None,
 ) -> int:
     """Say which logs of a fleet got better or worse, beyond noise: a gate for releases.
 
@@ -177,7 +160,7 @@ def compare(
     Example: semantic-mapper fleet compare runs/a runs/b --metric iou:person
     Example: semantic-mapper fleet compare runs/a runs/b --metric step_ms_p50
     """
-    limits = {"threshold": threshold, "log_threshold": log_threshold, "lower_is_better": lower_is_better}
+    limits = {"threshold": threshold, "log_threshold": log_threshold}
     with wrong_usage(SemanticMapperError):
         found = compare_stores(Store(store_a), Store(store_b), operation or "", metric, **limits)
     output.json({"worse": bool(found.reasons), **msgspec.to_builtins(found)})

@@ -200,7 +200,6 @@ def compare_stores(
     *,
     threshold: float = 0.0,
     log_threshold: float = 0.02,
-    lower_is_better: bool | None = None,
 ) -> FleetComparison:
     """Compare the latest results of the same logs, paired by the content of these.
 
@@ -215,7 +214,6 @@ def compare_stores(
         metric: "miou", "miou METHOD", "iou:CLASS", another metric of the results, or a cost.
         threshold: B is worse where the interval of its mean lies below minus this, in units of the metric.
         log_threshold: A log is worse where it is sure to have lost more than this.
-        lower_is_better: None = as is known of the metric.
     """
     results = list(store_a.results())
     operations = sorted({result.operation for result in results})
@@ -228,9 +226,8 @@ def compare_stores(
     names = {name for result in a.values() for name, value in _values(result).items() if value is not None}
     if metric not in names:
         raise ConfigError(f"{store_a.shown}: no result has the metric {metric!r}{nearest(metric, sorted(names))}")
-    if lower_is_better is None:
-        costs = {"seconds", *(name for result in a.values() for name in result.findings.costs)}
-        lower_is_better = metric in _LOWER_IS_BETTER or metric in costs
+    costs = {"seconds", *(name for result in a.values() for name in result.findings.costs)}
+    lower_is_better = metric in _LOWER_IS_BETTER or metric in costs
     sign = -1.0 if lower_is_better else 1.0
     errors = {failure.log: failure.error for failure in store_b.failures() if failure.operation == operation}
     changes = [

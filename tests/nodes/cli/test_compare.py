@@ -11,14 +11,12 @@ from tests.nodes.support import refused, run, run_ok
 
 def test_each_outcome_has_an_exit_code(replayed: Path, log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     copy, fewer = shutil.copytree(replayed, tmp_path / "copy"), tmp_path / "fewer"
-    assert json.loads(run_ok("compare", replayed, copy, "--exact", "--json").stdout)["equal"]
+    assert json.loads(run_ok("compare", replayed, copy, "--json").stdout)["equal"]
     run_ok("map", log, "--out", fewer, "--weights", weights, "--config", config, "--max-frames", "5")
     done = run("compare", replayed, fewer)
     assert done.returncode == 1 and "different: frames.published, frames.fused" in done.stdout, done.stderr
     loose = (replayed / "map.npz", fewer / "map.npz", "--surface-m", "9", "--labels", "1")
     assert "is a map alone" in json.loads(run_ok("compare", *loose, "--json").stdout)["notes"][0]
-    done = run("compare", *loose, "--exact")
-    assert done.returncode == 1 and "different: other bytes" in done.stdout
     (copy / "map.npz").write_bytes((replayed / "map.npz").read_bytes()[:-100])
     for other, said in ((tmp_path / "gone", "no such map file"), (copy, "map.npz"), (log, "is a log; `semantic-")):
         assert said in refused("compare", replayed, other, code=2)

@@ -81,7 +81,7 @@ def test_metrics_and_costs_without_stretches_are_judged_over_logs_together(compa
     assert found.lower_is_better and found.count("worse") == 0 and not any(log.estimate for log in found.logs)
     assert found.reasons == ("the mean of step_ms_p50 over logs is worse",)
     assert not compared(logs(8), slower, metric="step_ms_p50", threshold=20).reasons
-    assert not compared(logs(8), slower, metric="step_ms_p50", lower_is_better=False).reasons
+    assert not compared(slower, logs(8), metric="step_ms_p50").reasons
 
 
 def test_one_log_is_judged_by_its_stretches(compared: Any) -> None:
