@@ -135,7 +135,7 @@ def test_files_and_numbers_that_cannot_be_used_are_refused_by_name(tmp_path: Pat
         (("map", pipe, "--out", tmp_path / "o"), f"{pipe}: cannot be read: it is no regular file"),
         (("import", pipe, tmp_path / "o.mcap"), f"{pipe}: is neither a file nor a folder"),
         (("query", "://", "info"), "://: no endpoint; endpoints read"),
-        (("info", big), "value has 5000 digits"),
+        (("finetune", log, "--kind", "panoptic", "--boxes", big, "--out", tmp_path / "s"), "value has 5000 digits"),
     ):
         shown = refused(*words, code=2 if words[0] == "up" else 1)
         assert said in shown and "sys.set_int" not in shown
