@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 
 from semantic_mapper.errors import FrameError, LabelError, PoseError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, Segments, confusion_of
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.weights import WeightsFile
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
@@ -141,7 +141,6 @@ class MapSession:
         self.stage_ms: dict[str, LatencyHistogram] = {}
         self.confusion = ConfusionMatrix(self.pipeline.label_set)
         self.per_image = ImageMeans()
-        self.segments = Segments(self.pipeline.label_set)
         self.truth = None if stream_labels is None else TruthMapper(stream_labels, self.pipeline.label_set)
         self.surface_truth = SurfaceTruth(self.pipeline.label_set)
         self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
@@ -326,7 +325,6 @@ class MapSession:
         image = confusion_of(truth, update.label, self.pipeline.label_set, f"frame seq={frame.seq}")
         self.confusion += image
         self.per_image.add(image)
-        self.segments.add(image)
         self.surface_truth.add(replace(frame, label=truth))
         return frame
 

@@ -23,7 +23,7 @@ from semantic_mapper.nodes.cli.verb import (
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.console import table as make_table
 from semantic_mapper.nodes.fleet.cluster import connected
-from semantic_mapper.nodes.fleet.results import FleetComparison, Rows, Tables, compare_stores
+from semantic_mapper.nodes.fleet.results import FleetComparison, LogChange, Rows, Tables, compare_stores
 from semantic_mapper.nodes.fleet.store import Store, find_inputs
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted, without_secrets
@@ -147,7 +147,7 @@ def compare(
     operation: Operation | None = None,  # not needed where A has results of one only
     metric: str = "miou",  # miou, "miou METHOD", iou:CLASS, or another metric or cost
     threshold: AtLeastZero = 0.0,  # allowed loss of the mean over logs, in units of the metric
-    log_threshold: AtLeastZero = 0.02,  # allowed loss of a single log
+    log_threshold: AtLeastZero = 0.05,  # allowed loss of the score of a single log
 ) -> int:
     """Say which logs of a fleet got better or worse, beyond noise: a gate for releases.
 
@@ -186,14 +186,16 @@ def _show_comparison(output: Output, found: FleetComparison) -> None:
     direction = "lower" if found.lower_is_better else "higher"
     changed = [log for log in found.logs if log.status != "same"]
     rows: list[tuple[Any, ...]] = []
-    for change in (*changed[:MAX_LOGS], found.mean):
-        difference = "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"
-        interval = "-" if (noise := change.estimate) is None else f"{noise.low:+.4f} .. {noise.high:+.4f}"
-        rows.append((change.log, change.a, change.b, difference, interval, f"{change.status} {change.reason}".strip()))
-    names = ("log", "A", "B", "difference", "95 % interval", "")
+    for change in changed[:MAX_LOGS]:
+        rows.append((change.log, change.a, change.b, _difference(change), f"{change.status} {change.reason}".strip()))
+    interval = "" if found.interval is None else "95 % interval {:+.4f} to {:+.4f}".format(*found.interval)
+    rows.append(("mean over logs", found.a, found.b, _difference(found), interval))
+    names = ("log", "A", "B", "difference", "")
     output.print(f"{found.operation}, {found.metric} ({direction} is better)", _shown(Rows(names, rows)))
     counts = ", ".join(f"{counted(found.count(status), 'log')} {status}" for status in ("worse", "better", "same"))
     output.print(f"{counts}; --json gives all")
-    if unknown := sum(log.estimate is None and log.b is not None for log in found.logs):
-        output.print(f"note: {counted(unknown, 'log')} without the same stretches in both: judged together only")
     output.print(f"worse: {'; '.join(found.reasons)}" if found.reasons else "not worse")
+
+
+def _difference(change: LogChange | FleetComparison) -> str:
+    return "-" if change.a is None or change.b is None else f"{change.b - change.a:+.4f}"

@@ -17,10 +17,8 @@ import scipy  # loads `stats` when it is first used
 
 from semantic_mapper.config import nearest
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.metrics import miou_of_sums
 from semantic_mapper.nodes.fleet.store import Store, TaskResult, fleet_package
 from semantic_mapper.plain_text import counted
-from semantic_mapper.types import Float64
 
 _SQL = re.compile(r"\W*(select|with|from|pivot|unpivot|describe|summarize|show|values)\b", re.IGNORECASE)
 _LOG_TEXTS = ("key", "operation", "log", "log_digest", "weights", "settings", "version", "node", "folder")
@@ -136,14 +134,8 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, int | str | None) else str(value)
 
 
-# Comparison. Noise of a log: a paired block bootstrap. Stretches of consecutive frames are drawn with replacement, the
-# same ones for both results (Künsch 1989; Efron and Tibshirani 1993). The spread of the difference over the draws is
-# its standard error; intervals and p-values are Student's with one degree of freedom less than there are stretches:
-# percentiles of the draws would be too narrow for a dozen stretches, and know no p-value below one in the number of
-# draws. Noise of the mean over logs: the same over logs, whose standard error has a closed form. Many logs:
-# Benjamini-Hochberg, which names a log as rarely as Bonferroni-Holm where none is worse, and finds more where some are.
+# Comparison: Student's paired t-test over logs, and a limit for each score of a log by itself.
 
-_RESAMPLES = 1000
 _CONFIDENCE = 0.95  # of intervals; a fleet that is no worse is called worse in at most one of twenty comparisons
 
 # Costs are better lower, too; all others are better higher.
@@ -156,23 +148,12 @@ _LOWER_IS_BETTER = {
 _BAD = {"failed": "failed in B", "missing": "missing in B", "unscored": "without a score in B", "worse": "worse"}
 
 
-class Estimate(msgspec.Struct, frozen=True):
-    """A difference B - A, its standard error with degrees of freedom, and the ends of its interval."""
-
-    difference: float
-    error: float
-    freedom: int
-    low: float
-    high: float
-
-
 class LogChange(msgspec.Struct, frozen=True):
-    """One log in both results, or the mean over all with a score in both."""
+    """One log in both results."""
 
     log: str  # its URL in A
     a: float | None  # the metric; None = no score
     b: float | None = None
-    estimate: Estimate | None = None  # none where its noise is unknown
     status: str = "same"  # "worse", "better", "same"; "failed", "missing", "unscored": has a score in A only
     reason: str = ""  # why it failed
 
@@ -183,7 +164,9 @@ class FleetComparison(msgspec.Struct, frozen=True):
     operation: str
     metric: str
     lower_is_better: bool
-    mean: LogChange  # over logs
+    a: float | None  # mean over the logs that both have a score of; None = there is none
+    b: float | None
+    interval: tuple[float, float] | None  # of the mean difference B - A; None = fewer than two such logs
     logs: tuple[LogChange, ...]  # the worst first
     reasons: tuple[str, ...]  # why B is worse; empty = it is not
 
@@ -199,7 +182,7 @@ def compare_stores(
     metric: str = "miou",
     *,
     threshold: float = 0.0,
-    log_threshold: float = 0.02,
+    log_threshold: float = 0.05,
 ) -> FleetComparison:
     """Compare the latest results of the same logs, paired by the content of these.
 
@@ -213,7 +196,7 @@ def compare_stores(
         operation: Empty = the only one that A has.
         metric: "miou", "miou METHOD", "iou:CLASS", another metric of the results, or a cost.
         threshold: B is worse where the interval of its mean lies below minus this, in units of the metric.
-        log_threshold: A log is worse where it is sure to have lost more than this.
+        log_threshold: A log is worse where its score has lost more than this; costs and counts of one log are noise.
     """
     results = list(store_a.results())
     operations = sorted({result.operation for result in results})
@@ -230,21 +213,27 @@ def compare_stores(
     lower_is_better = metric in _LOWER_IS_BETTER or metric in costs
     sign = -1.0 if lower_is_better else 1.0
     errors = {failure.log: failure.error for failure in store_b.failures() if failure.operation == operation}
+    limit = log_threshold if metric.startswith(("miou", "iou:")) else math.inf
     changes = [
-        _change(result, b.get(digest), metric, errors)
+        _change(result, b.get(digest), metric, errors, sign, limit)
         for digest, result in a.items()
         if digest not in b or _values(result).get(metric) is not None
     ]
-    mean = _mean(changes)
-    changes = sorted(_judged(changes, log_threshold, sign), key=lambda change: _rank(change, sign))
+    changes.sort(key=lambda change: _rank(change, sign))
+    before, after = np.array([(c.a, c.b) for c in changes if c.b is not None], np.float64).reshape(-1, 2).T
+    means = (float(before.mean()), float(after.mean())) if len(before) else (None, None)
+    interval, gain = None, after - before
+    if len(gain) > 1:
+        reach = float(scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2, len(gain) - 1) * scipy.stats.sem(gain))
+        interval = float(gain.mean()) - reach, float(gain.mean()) + reach
     reasons: list[str] = []
-    if mean.estimate is not None and max(sign * mean.estimate.low, sign * mean.estimate.high) < -threshold:
-        limit = f" by more than {threshold:g}" if threshold else ""
-        reasons.append(f"the mean of {metric} over logs is worse{limit}")
+    if interval is not None and max(sign * end for end in interval) < -threshold:
+        limit_text = f" by more than {threshold:g}" if threshold else ""
+        reasons.append(f"the mean of {metric} over logs is worse{limit_text}")
     for status, text in {**_BAD, "worse": f"worse by more than {log_threshold:g}"}.items():
         if count := sum(change.status == status for change in changes):
             reasons.append(f"{counted(count, 'log')} {text}")
-    return FleetComparison(operation, metric, lower_is_better, mean, tuple(changes), tuple(reasons))
+    return FleetComparison(operation, metric, lower_is_better, *means, interval, tuple(changes), tuple(reasons))
 
 
 def _latest(results: Iterator[TaskResult] | Sequence[TaskResult], operation: str) -> dict[str, TaskResult]:
@@ -259,75 +248,18 @@ def _values(result: TaskResult) -> dict[str, float | None]:
     return {"seconds": result.seconds, **found.costs, **found.metrics, **classes}
 
 
-def _stretches(result: TaskResult, metric: str) -> tuple[Float64, object] | None:
-    """(S, 3, L) what the metric is computed from, of the first method or the one that it names; and what these are."""
-    of_class = metric.removeprefix("iou:") if metric.startswith("iou:") else None
-    for number, scores in enumerate(result.findings.scores):
-        is_meant = number == 0 if metric == "miou" or of_class is not None else metric == f"miou {scores.method}"
-        if is_meant and len(scores.stretches) > 1:
-            chosen = np.array([of_class is None or name == of_class for name in scores.names])
-            return np.array(scores.stretches, np.float64)[:, :, chosen], (scores.first, scores.names)
-    return None
-
-
-def _change(a: TaskResult, b: TaskResult | None, metric: str, errors: Mapping[str, str]) -> LogChange:
-    """Whether a log with a score in both is worse is left open."""
+def _change(
+    a: TaskResult, b: TaskResult | None, metric: str, errors: Mapping[str, str], sign: float, limit: float
+) -> LogChange:
     before = _values(a).get(metric)
     if b is None:
         status = "failed" if a.log in errors else "missing"
         return LogChange(a.log, before, status=status, reason=errors.get(a.log, ""))
     after = _values(b).get(metric)
-    if after is None:
+    if before is None or after is None:
         return LogChange(a.log, before, status="unscored")
-    of_a, of_b = _stretches(a, metric), _stretches(b, metric)
-    if of_a is None or of_b is None or of_a[1] != of_b[1]:
-        return LogChange(a.log, before, after)
-    return LogChange(a.log, before, after, _bootstrapped(of_a[0], of_b[0]))
-
-
-def _bootstrapped(a: Float64, b: Float64) -> Estimate | None:
-    """Of the stretches (S, 3, L) of a log in both results."""
-    count = len(a)
-    times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), _RESAMPLES)  # (B, S) how often each
-    times = np.concatenate((np.ones((1, count)), times))  # all of them once, first
-    before, after = (miou_of_sums(np.einsum("bs,skl->bkl", times, sums)) for sums in (a, b))
-    observed, drawn = float((after - before)[0]), (after - before)[1:]
-    drawn = drawn[np.isfinite(drawn)]
-    if len(drawn) < _RESAMPLES // 2:
-        return None  # the class is in so few stretches that most draws lack it
-    return _estimate(observed, float(drawn.std()) * math.sqrt(count / (count - 1)), count - 1)
-
-
-def _estimate(difference: float, error: float, freedom: int) -> Estimate:
-    reach = float(scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2, freedom)) * error
-    return Estimate(difference, error, freedom, difference - reach, difference + reach)
-
-
-def _judged(changes: Sequence[LogChange], threshold: float, sign: float) -> Iterator[LogChange]:
-    """With those that are surely worse or better by more than the threshold."""
-    known = {number: change.estimate for number, change in enumerate(changes) if change.estimate is not None}
-    status: dict[int, str] = {}
-    for name, direction in (("worse", sign), ("better", -sign)):
-        distances = [(direction * estimate.difference + threshold, estimate) for estimate in known.values()]
-        p_values = [  # one-sided, of "the true difference is not below minus the threshold"
-            float(scipy.stats.t.cdf(d / e.error, e.freedom)) if e.error else float(d >= 0) for d, e in distances
-        ]
-        sure = scipy.stats.false_discovery_control(p_values) <= (1 - _CONFIDENCE) / 2 if known else []
-        status |= {number: name for number, is_sure in zip(known, sure, strict=True) if is_sure}
-    for number, change in enumerate(changes):
-        yield msgspec.structs.replace(change, status=status.get(number, change.status))
-
-
-def _mean(changes: Sequence[LogChange]) -> LogChange:
-    both = [change for change in changes if change.b is not None]
-    if not both:
-        return LogChange("mean over logs", None)
-    a, b = np.array([(change.a, change.b) for change in both], np.float64).T
-    estimate = both[0].estimate
-    if len(both) > 1:
-        error = float((b - a).std(ddof=1)) / math.sqrt(len(both))
-        estimate = _estimate(float((b - a).mean()), error, len(both) - 1)
-    return LogChange("mean over logs", float(a.mean()), float(b.mean()), estimate)
+    gain = sign * (after - before)
+    return LogChange(a.log, before, after, "worse" if gain < -limit else "better" if gain > limit else "same")
 
 
 def _rank(change: LogChange, sign: float) -> tuple[int, float, str]:

@@ -38,7 +38,6 @@ from semantic_mapper.config import (
     to_plain,
 )
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
-from semantic_mapper.evaluation.metrics import Segments, class_sums
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.weights import shipped_checkpoint
 from semantic_mapper.files import write_json
@@ -406,7 +405,7 @@ class Operation:
 
 
 def _map(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> Findings:
-    summary, session = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
+    summary, _ = replay_log(log, out, weights, _part(settings, MapperConfig), settings.max_frames)
     metrics = {name: dig(summary, f"metrics.{name}") for name in (*_SCORES, "map_miou")}
     metrics |= {f"frames_{name}": count for name, count in summary["frames"].items()}
     metrics |= {name: summary["map"][name] for name in ("surface_points", "blocks", "cleared_voxels", "unknown")}
@@ -416,7 +415,7 @@ def _map(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> F
     events += [("damaged", text) for text in summary["damaged_stretches"]]
     events += [("refused", f"frame {r['seq']}: {r['reason']}") for r in summary["refusals"]]
     costs["map_memory_mb"] = summary["map"]["memory_mb"]
-    scores = _scores("map", dig(summary, "metrics.per_class") or {}, session.segments)
+    scores = MethodScores("map", dig(summary, "metrics.per_class") or {})
     return Findings(metrics=metrics, costs=costs, scores=(scores,), events=tuple(events[:_MAX_EVENTS]))
 
 
@@ -431,7 +430,7 @@ def _eval(log: Path, out: Path, weights: Path | None, settings: LogSettings) -> 
     metrics = {key: main.get(key) for key in (*_SCORES, "ece")}
     metrics |= {f"miou {method}": figures.get("miou") for method, figures in methods.items()}
     metrics |= {f"frames_{key}": scores[key] for key in ("scored", "excluded", "refused", "damaged", "pseudo_labelled")}
-    scored = (_scores(method, f["per_class"], result.segments.get(method)) for method, f in methods.items())
+    scored = (MethodScores(method, figures["per_class"]) for method, figures in methods.items())
     return Findings(metrics=metrics, scores=tuple(scored))
 
 
@@ -475,11 +474,3 @@ OPERATIONS: Mapping[str, Operation] = {
 def _part(settings: Config, kind: type[ConfigT]) -> ConfigT:
     """Those settings that a job's own config has."""
     return kind(**{name: getattr(settings, name) for name in kind.__struct_fields__})
-
-
-def _scores(method: str, iou: dict[str, float | None], segments: Segments | None) -> MethodScores:
-    if segments is None:
-        return MethodScores(method, iou)
-    parts = segments.all()
-    stretches = tuple(tuple(tuple(row) for row in class_sums(part.confusion.counts).tolist()) for part in parts)
-    return MethodScores(method, iou, tuple(segments.label_set.names), stretches, tuple(part.first for part in parts))

@@ -45,11 +45,6 @@ class MethodScores(msgspec.Struct, frozen=True):
 
     method: str  # "map", or a method of ``eval`` such as "sray" or "own image alone"
     iou: dict[str, float | None]  # intersection over union, 0..1, by class
-    names: tuple[str, ...] = ()  # L names of classes of ``stretches``
-    # (S, 3, L) pixels of S stretches of consecutive scored frames, which comparisons draw again: by class hits, truth,
-    # and union of truth and prediction
-    stretches: tuple[tuple[tuple[int, ...], ...], ...] = ()
-    first: tuple[int, ...] = ()  # (S,) numbers of the first scored frames of the stretches
 
 
 class Findings(msgspec.Struct, frozen=True):

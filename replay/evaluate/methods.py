@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix, Segments, confusion_of
+from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
 from semantic_mapper.evaluation.panoptic import PanopticImage
 from semantic_mapper.fields.scene.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
@@ -62,25 +62,22 @@ class Evaluation:
     pseudo_labelled: int = 0
     damaged: int = 0
     weights: str = ""
-    segments: Mapping[str, Segments] = field(default_factory=dict[str, Segments])  # by method, but for that of the map
 
     def plain(self) -> dict[str, Any]:
-        """As plain data, without ``segments``."""
-        return {name: getattr(self, name) for name in self.__slots__ if name != "segments"}
+        """As plain data."""
+        return {name: getattr(self, name) for name in self.__slots__}
 
 
 class _Scores:
     """Of one method."""
 
     def __init__(self, label_set: LabelSet) -> None:
-        self.confusion, self.segments = ConfusionMatrix(label_set), Segments(label_set)
+        self.confusion = ConfusionMatrix(label_set)
         self.confidence = ConfidenceScores()
 
     def add(self, truth: UInt8, found: Opinion, known: NDArray[np.bool_], where: str) -> None:
         """Count one image, or the points of a map; ``known`` are the pixels whose confidence counts."""
-        image = confusion_of(truth, found.label, self.confusion.label_set, where)
-        self.confusion += image
-        self.segments.add(image)
+        self.confusion.update(truth, found.label, where)
         if found.confidence is not None:
             strange = truth == self.confusion.label_set.ignore_id
             self.confidence.update(found.confidence[known], (found.label == truth)[known], strange[known])
@@ -214,5 +211,4 @@ def evaluate_frames(
             methods[SEEN] = {**panoptic.score(voxel_map)}
             for name, figures in panoptic.score_methods().items():
                 methods[name] |= figures
-    segments = {name: of.segments for name, of in scores.items()}
-    return Evaluation(methods, scored, excluded, refused, pseudo, segments=segments)
+    return Evaluation(methods, scored, excluded, refused, pseudo)

@@ -49,7 +49,6 @@ def test_a_replay_of_the_fleet_is_that_of_the_verb(
     assert found.findings.metrics["frames_fused"] == summary["frames"]["fused"] == 6
     (scores,) = found.findings.scores
     assert scores.iou == summary["metrics"]["per_class"]
-    assert sum(sum(part[1]) for part in scores.stretches) == summary["metrics"]["pixels"]
 
     monkeypatch.setattr(run, "_upload", lambda *args: pytest.fail("done again"))
     copied = shutil.copy(log, tmp_path / "other-name.mcap")  # the content counts, not the name
