@@ -14,7 +14,7 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, find_up, occupancy_grid, write_map_server
-from semantic_mapper.mapping.formats import ColorBy, colored, sure_faces, sure_points, write_glb, write_npz, write_ply
+from semantic_mapper.mapping.formats import ColorBy, colored, sure_faces, sure_points, write_glb, write_ply
 from semantic_mapper.mapping.fusion import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -23,7 +23,7 @@ from semantic_mapper.replay.exporters.base import choose_format
 from semantic_mapper.replay.run_folder import MAP_SUFFIX
 from semantic_mapper.types import Float64
 
-Format = Literal["ply", "ply-mesh", "glb", "npz", "grid", "rrd"]
+Format = Literal["ply", "ply-mesh", "glb", "grid", "rrd"]
 SUFFIXES: dict[str, Format] = {".ply": "ply", ".glb": "glb", ".pgm": "grid", ".yaml": "grid", ".rrd": "rrd"}
 FORMATS: tuple[Format, ...] = get_args(Format)
 # Formats that an option is for, besides min_weight and min_confidence.
@@ -66,7 +66,7 @@ def format_of(path: Path, given: str | None) -> Format:
     if given is None and path.suffix.lower() == MAP_SUFFIX:
         raise ConfigError(
             f"{path}: so end saved maps, which the mapper writes (a running one at its end, and by save_every_s); "
-            "--format npz writes arrays of points"
+            ".ply has its points, with label and confidence"
         )
     return choose_format(path, given, SUFFIXES, FORMATS)
 
@@ -114,8 +114,6 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
     points = sure_points(voxel_map.points(request.min_weight), request.min_confidence)
     if request.format == "ply":
         write_ply(path, colored(points, labels, request.color or "rgb"), labels, scale_known=voxel_map.scale_known)
-    elif request.format == "npz":
-        write_npz(path, points, labels, scale_known=voxel_map.scale_known)
     else:
         with atomic_path(path, raises=MapError) as part:
             from semantic_mapper.replay.rerun_log import RerunLog, recording_file

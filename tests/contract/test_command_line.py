@@ -41,7 +41,7 @@ COMMANDS: dict[str, str] = {
     "query of an unknown kind": "query {map} why",
     "query of a mapper that is not there": "query ipc://{tmp}/none info",
     "export points": "export {map} --out {tmp}/map.ply",
-    "export over itself": "export {stored} --out {map} --format npz",
+    "export over itself": "export {stored} --out {map} --format ply",
     "export a log as mesh": "export {log} --out {tmp}/log.glb",
     "export to an unknown format": "export {map} --out {tmp}/map.stl",
     "export without a file": "export {map}",

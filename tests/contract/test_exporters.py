@@ -83,15 +83,6 @@ def look_at_glb(folder: Path) -> dict[str, Any]:
     }
 
 
-def look_at_npz(folder: Path) -> dict[str, Any]:
-    """Arrays by name."""
-    with np.load(export(MAP, folder / "points.npz", "--format", "npz")) as kept:
-        arrays = {name: [kept[name].dtype.kind, kept[name].ndim] for name in kept.files}
-        points = Points(kept["xyz"], kept["rgb"], kept["label"], kept["confidence"])
-        names = dict(zip(map(str, kept["label_ids"].tolist()), kept["label_names"].tolist(), strict=True))
-    return {"arrays": arrays, "points": describe(points), "names": names}
-
-
 def look_at_grid(folder: Path) -> dict[str, Any]:
     """A floor plan for map servers."""
     text = export(MAP, folder / "plan.yaml", "--up", "z", "--floor", "0", "--resolution", "0.2").read_text()
@@ -175,7 +166,6 @@ _LOOKS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "ply": look_at_ply,
     "ply-mesh": look_at_ply_mesh,
     "glb": look_at_glb,
-    "npz": look_at_npz,
     "grid": look_at_grid,
     "rrd": look_at_rrd,
     "trajectory": look_at_trajectory,

@@ -14,7 +14,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.floor_plan import find_up
-from semantic_mapper.mapping.formats import colored, sure_faces, sure_points, write_glb, write_npz, write_ply
+from semantic_mapper.mapping.formats import colored, sure_faces, sure_points, write_glb, write_ply
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64
@@ -110,9 +110,6 @@ def test_ply_says_what_its_labels_mean(tmp_path: Path) -> None:
 def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tmp_path: Path) -> None:
     some, all_ = np.array([True, False, False, True]), np.ones(4, np.bool_)
     for measured, said in ((some, True), (all_, False)):
-        write_npz(tmp_path / "map.npz", replace(POINTS, measured=measured), LABELS)
-        with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-            assert ("measured" in read.files) == said and (not said or (read["measured"] == some).all())
         for surface in (POINTS, MESH):
             write_ply(tmp_path / "map.ply", replace(surface, measured=measured), LABELS)
             point = load_open3d().t.io.read_point_cloud(str(tmp_path / "map.ply")).point
