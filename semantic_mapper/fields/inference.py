@@ -196,10 +196,8 @@ class _Builder:
     def _up(self, name: str, x: Node, skip: Node, refine: int) -> Node:
         _, out, height, width = skip.get_output_shape(0)
         x = self._conv(f"{name}.reduce", x, out, 1)
-        x = ops.interpolate(
-            x, np.array([2.0, 2.0], np.float32), "nearest", "scales", axes=np.array([2, 3]),
-            coordinate_transformation_mode="asymmetric", nearest_mode="floor",
-        )  # fmt: skip
+        # Each value four times: `interpolate` of OpenVINO 2026.4.1 runs on no processor without AVX.
+        x = ops.depth_to_space(ops.concat([x] * 4, 1), "blocks_first", 2)
         x = ops.slice(x, [0, 0], [height, width], [1, 1], [2, 3]) + skip
         for i in range(refine):
             x = self._residual(f"{name}.refine" if refine == 1 else f"{name}.refine.{i}", x, out, 1)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 
 import msgspec
@@ -139,3 +143,12 @@ def test_without_depth_there_is_nothing_and_holes_stay_holes():
     depth[70:80, 60:90] = 0
     maps = surface_maps(depth, K)
     assert np.isfinite(maps).all() and not maps[:, 70:80, 60:90].any() and maps.any()
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="processors without AVX are x86-64")
+def test_the_mapper_encodes_on_a_processor_without_avx() -> None:
+    code = "from semantic_mapper import Mapper, open_log; from semantic_mapper.replay.log import demo_log\n"
+    code += "m = Mapper.load()\nwith open_log(demo_log()) as log: print(m.step(log.frame(0)).label.shape)"
+    limited = os.environ | {"ONEDNN_MAX_CPU_ISA": "SSE41", "ATEN_CPU_CAPABILITY": "default"}
+    done = subprocess.run([sys.executable, "-c", code], env=limited, capture_output=True, text=True, check=False)
+    assert "(240, 320)" in done.stdout, done.stderr
