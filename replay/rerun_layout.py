@@ -35,7 +35,7 @@ CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
-FOCAL = 1.12 / np.tan(np.deg2rad(55) / 2)  # Rerun's, with a margin; in halves of a view's height, its least width
+FOCAL = 1.16 / np.tan(np.deg2rad(55) / 2)  # Rerun's, with a margin for outlines; in halves of a view's height
 _MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
@@ -51,12 +51,12 @@ def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
     """An eye on a map, points (N, 3), N > 0, from above, on its most open side. ``up`` (3,) is a first guess of which
     way is up; None = unknown."""
     R_upright_world = upright_rotation(xyz, up)
-    upright = xyz[~in_ceiling(xyz, R_upright_world[2])].astype(np.float64) @ R_upright_world.T
+    upright = xyz.astype(np.float64) @ R_upright_world.T
     azimuth = open_side(upright)
     R_view_world = from_angle(np.eye(3), azimuth, ELEVATION).T @ R_upright_world  # right, down, away from the viewer
     x, y, z = from_angle(upright, azimuth, ELEVATION).T
     # The edges of the view are planes through the eye: of each, the point that is farthest out, but for stray ones.
-    a, b, c, d = (float(np.percentile(side - z / FOCAL, 99.8)) for side in (x, -x, y, -y))
+    a, b, c, d = (float(np.percentile(side - z / FOCAL, 99.95)) for side in (x, -x, y, -y))
     across, away = np.array(((a - b) / 2, (c - d) / 2)), FOCAL * max(a + b, c + d) / 2
     middle = float(np.median(z))
     position, target = (np.append(across, depth) for depth in (min(-away, middle - 0.3), middle))

@@ -42,9 +42,9 @@ def test_the_first_look_is_from_above_into_a_room_without_its_ceiling(ceiling: b
     ahead = eye.target - eye.position
     right = np.cross(ahead, eye.up)
     axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(ahead, right), ahead)]
-    x, y, z = axes @ (xyz[~hidden] - eye.position).T
+    x, y, z = axes @ (xyz - eye.position).T
     out = np.maximum(abs(x), abs(y)) / z / np.tan(np.deg2rad(55 / 2))  # 1 = at the edge of a view that is square
-    assert np.percentile(out, 99) > 0.85 and out.max() < 1.02
+    assert np.percentile(out, 99) > 0.8 and out.max() < 1.02
 
 
 def test_what_moves_is_shown_where_it_was_seen() -> None:
