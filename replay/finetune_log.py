@@ -21,7 +21,6 @@ from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.irt import IRT
 from semantic_mapper.fields.scene.panoptic import Panoptic, box_config
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.weights import anchor_from_frame, default_checkpoint_path
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_spread, working_intrinsics
@@ -61,7 +60,6 @@ class FinetuneRequest:
     keyframes: int = 0
     config: FinetuneConfig = field(default_factory=FinetuneConfig)  # of the training
     weights: Path | None = None  # to start from; None = those in the package
-    from_scratch: bool = False  # start from random ones
     # where the frames' depth comes from
     depth: DepthConfig = field(default_factory=lambda: DepthConfig(source="sensor"))
     kind: str | None = None  # of a field that is fitted to one scene, from nothing; None = that of the weights
@@ -92,9 +90,8 @@ def finetune_log(request: FinetuneRequest, monitor: JobMonitor | None = None) ->
 
 def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Checkpoint, list[int]]:
     # First, so that a wrong path does not cost the reading of a log.
-    nothing = request.from_scratch or request.kind is not None
-    start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
-    kind = request.kind or (SRay.kind if start is None else start.model.kind)
+    start = None if request.kind else load_checkpoint(request.weights or default_checkpoint_path())
+    kind = str(request.kind) if start is None else start.model.kind
     if request.config.irt.variant is not None and kind != IRT.kind:
         raise ConfigError(f"irt.variant: goes with weights of kind 'irt', not with '{kind}'; leave it out")
     with open_log(request.log) as log:

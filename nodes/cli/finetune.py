@@ -32,7 +32,6 @@ def finetune(
     out: Path,  # weights file to write (.safetensors)
     keyframes: AtLeastTwo | None = None,  # how many labelled frames to use
     weights: Path | None = None,  # to start from, in place of the package's
-    from_scratch: bool = False,  # start from random weights
     # of this scene alone; classes of keyframes (irt), of boxes (panoptic), or none (grid)
     kind: Literal["irt", "panoptic", "grid"] | None = None,
     boxes: Path | None = None,  # panoptic: a file of boxes
@@ -56,7 +55,6 @@ def finetune(
     without_labels = kind in ("grid", "panoptic")
     refuse_options(
         (kind is not None and weights is not None, "--kind", "starts from nothing; leave out --weights"),
-        (from_scratch and (weights or kind), "--from-scratch", "leave out --weights and --kind"),
         ((boxes is not None) != (kind == "panoptic"), "--boxes", "--kind panoptic and --boxes FILE go together"),
         (pseudo is not None and kind != "panoptic", "--pseudo", "goes with --kind panoptic only"),
         (without_labels and (labels or keyframes or strokes), "--kind", f"{kind} learns from no keyframes and strokes"),
@@ -76,7 +74,6 @@ def finetune(
         keyframes=keyframes or 0,
         config=settings,
         weights=weights,
-        from_scratch=from_scratch,
         depth=load_mapper_config(None, {"depth.source": depth}, OFFLINE).depth,
         kind=kind,
         labels=labels,
