@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, class_sums, miou_of_sums
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, class_sums
 from semantic_mapper.types import Float64
 
 RESAMPLES = 10_000
@@ -81,4 +81,7 @@ def _difference(counts: Float64, times: Float64, factor: float) -> Float64:
 
 def miou_of_counts(counts: NDArray[np.float64]) -> Float64:
     """(B, L, L + 1) -> (B,), the rules of ``ConfusionMatrix.iou``: means over classes in the truth, NaN for none."""
-    return miou_of_sums(class_sums(counts))
+    hits, occurring, union = np.moveaxis(class_sums(counts), -2, 0)
+    iou = np.divide(hits, union, out=np.zeros_like(hits), where=occurring > 0)
+    present = (occurring > 0).sum(axis=-1)
+    return np.divide(iou.sum(axis=-1), present, out=np.full(present.shape, np.nan), where=present > 0)

@@ -190,11 +190,3 @@ def class_sums(counts: NDArray[Any]) -> NDArray[Any]:
     occurring = counts.sum(axis=-1)
     union = occurring + counts[..., :-1].sum(axis=-2) - hits
     return np.stack((hits, occurring, union), axis=-2)
-
-
-def miou_of_sums(sums: NDArray[Any]) -> Float64:
-    """(..., 3, L) of ``class_sums`` -> (...,) mIoU by the rules of ``ConfusionMatrix``, NaN without a truth."""
-    hits, occurring, union = np.moveaxis(sums.astype(np.float64), -2, 0)
-    iou = np.divide(hits, union, out=np.zeros_like(hits), where=occurring > 0)
-    present = (occurring > 0).sum(axis=-1)
-    return np.divide(iou.sum(axis=-1), present, out=np.full(present.shape, np.nan), where=present > 0)
