@@ -11,10 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import nn
 
-from semantic_mapper.config import (
-    Config,
-    SamplingConfig,
-)
+from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.kinds import field_config, field_kinds
 from semantic_mapper.fields.views import EncodedViews
@@ -24,7 +21,7 @@ from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
 
 class LearnedField(nn.Module, ABC):
-    """Base of all fields with weights. Satisfies ``SemanticField``.
+    """Base of all fields with weights: what training, finetuning, evaluation and streaming ask of a field.
 
     A kind of field implements ``encode`` and ``render_samples``; sampling is shared, so that kinds differ in what they
     make of the samples and in nothing else. Kinds that find samples of their own implement ``render`` instead.
@@ -56,7 +53,7 @@ class LearnedField(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, views: SourceViews) -> EncodedViews:
-        """Encode source views."""
+        """Encode source views, each by itself; the result may be cached."""
 
     def render_samples(
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews

@@ -9,7 +9,6 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Protocol
 
 import torch
 from torch.nn import functional
@@ -18,9 +17,8 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedSize
 from semantic_mapper.fields.numbers import GEOMETRY_CHANNELS, MIN_DEPTH_M, UNSURE_SPREAD
 from semantic_mapper.geometry import expect_shape
-from semantic_mapper.labels import LabelSet
 from semantic_mapper.rays import invert_pose_torch
-from semantic_mapper.types import FieldRender, Float64, RayBatch, SourceViews
+from semantic_mapper.types import Float64, RayBatch, SourceViews
 
 SAME_CAMERA = 1e-3  # metres between the centres plus the error of a unit depth: float32 poses agree far better
 
@@ -63,23 +61,6 @@ def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
     if len(sizes) != 1:
         raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
     return EncodedViews(*(torch.cat([getattr(v, f.name) for v in views]) for f in fields(EncodedViews)))
-
-
-class SemanticField(Protocol):
-    """What training, finetuning, evaluation and streaming ask of a field."""
-
-    @property
-    def label_set(self) -> LabelSet:
-        """Classes of the rendered logits, in channel order."""
-        ...
-
-    def encode(self, views: SourceViews) -> EncodedViews:
-        """Encode source views, each by itself; the result may be cached."""
-        ...
-
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """Render rays from encoded source views; differentiable in training."""
-        ...
 
 
 def check_views(views: SourceViews) -> None:

@@ -88,7 +88,7 @@ def mirrored_view(view: LabelledView) -> LabelledView:
 
 
 def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:
-    """Views of one resolution as the input of ``SemanticField.encode``, and what is known of their labels if wanted."""
+    """Views of one resolution as the input of ``LearnedField.encode``, and what is known of their labels if wanted."""
     spreads = [v.depth_m.new_zeros(()) if v.computed_sigma_m is None else v.computed_sigma_m for v in views]
     computed = any(v.computed_sigma_m is not None for v in views)
     return SourceViews(
