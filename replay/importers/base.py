@@ -150,11 +150,7 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
 
 
 def camera_of(
-    where: object,
-    k: Iterable[float],
-    size: tuple[float, float],
-    model: str = "",
-    coefficients: Sequence[float] = (),
+    where: object, k: Iterable[float], size: tuple[float, float], model: str = "", coefficients: Sequence[float] = ()
 ) -> CameraIntrinsics:
     """Intrinsics by fx fy cx cy, (width, height) and a lens, see ``lens_intrinsics``.
 

@@ -15,13 +15,7 @@ import numpy as np
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose, transform, unproject
-from semantic_mapper.replay.importers.base import (
-    BadFrameError,
-    DepthScale,
-    ImportOptions,
-    depth_of_points,
-    read_depth,
-)
+from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, depth_of_points, read_depth
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
 from semantic_mapper.replay.importers.tables import numbered_files, read_matrix, without_picture
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64

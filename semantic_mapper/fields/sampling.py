@@ -39,7 +39,5 @@ def _even_in_inverse_depth(near_m: Float32, far_m: Float32, count: int) -> Float
 def around_computed(config: SamplingConfig) -> SamplingConfig:
     """The settings for depth priors that were computed from pictures: these may be farther off than a sensor's."""
     return msgspec.structs.replace(
-        config,
-        guided=max(COMPUTED_GUIDED, config.guided),
-        guided_sigma=max(COMPUTED_SIGMA, config.guided_sigma),
+        config, guided=max(COMPUTED_GUIDED, config.guided), guided_sigma=max(COMPUTED_SIGMA, config.guided_sigma)
     )

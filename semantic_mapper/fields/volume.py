@@ -92,10 +92,5 @@ def field_render(
     logits = logits * known[:, None]
     log_p = torch.log_softmax(logits, dim=-1)
     return FieldRender(
-        logits=logits,
-        depth_m=depth_m,
-        opacity=opacity,
-        rgb=rgb,
-        entropy=-(log_p.exp() * log_p).sum(-1),
-        known=known,
+        logits=logits, depth_m=depth_m, opacity=opacity, rgb=rgb, entropy=-(log_p.exp() * log_p).sum(-1), known=known
     )

@@ -215,9 +215,7 @@ class ParallelKernel(Generic[P]):
             raise MemoryError(f"kernel {self._kernel.name}: no memory for its buffers")
 
 
-def parallel_kernel(
-    chunks_per_thread: int = 1,
-) -> Callable[[Callable[Concatenate[int, P], None]], ParallelKernel[P]]:
+def parallel_kernel(chunks_per_thread: int = 1) -> Callable[[Callable[Concatenate[int, P], None]], ParallelKernel[P]]:
     """A `kernel` whose loop runs on several threads.
 
     The declaration's first argument is the number of iterations; C gets a range of them as ``start`` and ``stop``, and

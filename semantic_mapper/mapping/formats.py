@@ -121,9 +121,7 @@ def write_glb(path: Path, mesh: MapMesh, up: Float64, *, scale_known: bool = Tru
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "world", "mesh": 0, "matrix": turn.T.reshape(-1).tolist()}],  # column by column
-        "meshes": [
-            {"name": "map", "primitives": [primitive], "extras": {} if scale_known else {"scale": "unknown"}},
-        ],
+        "meshes": [{"name": "map", "primitives": [primitive], "extras": {} if scale_known else {"scale": "unknown"}}],
         "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
         "accessors": [{"bufferView": n, "count": len(array), **a} for n, (array, _, a) in enumerate(parts)],
         "bufferViews": [

@@ -12,24 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from semantic_mapper.geometry import (
-    invert_pose,
-    look_at,
-    nearest_pixels,
-    scale_intrinsics,
-    transform,
-    visible_points,
-)
+from semantic_mapper.geometry import invert_pose, look_at, nearest_pixels, scale_intrinsics, transform, visible_points
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
 from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.blocks import pack_keys
-from semantic_mapper.mapping.fusion import (
-    FULL_TRUST_RANGE_M,
-    make_limits,
-    make_votes,
-    vote_into_blocks,
-)
+from semantic_mapper.mapping.fusion import FULL_TRUST_RANGE_M, make_limits, make_votes, vote_into_blocks
 from semantic_mapper.mapping.keyframes import Keyframe
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int32, Int64

@@ -34,14 +34,7 @@ from semantic_mapper.mapping.changes import (
     received_parts,
 )
 from semantic_mapper.mapping.clearing import NO_BOUNDS, Scene, clear_in_view, depth_bounds
-from semantic_mapper.mapping.fusion import (
-    SURFACE_WEIGHT,
-    Votes,
-    checked_depth,
-    frame_votes,
-    fuse_blocks,
-    make_limits,
-)
+from semantic_mapper.mapping.fusion import SURFACE_WEIGHT, Votes, checked_depth, frame_votes, fuse_blocks, make_limits
 from semantic_mapper.mapping.map_file import BlockPart, MapManifest, open_map
 from semantic_mapper.mapping.map_snapshot import FrozenMap
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView, require_same_scale, scale_name

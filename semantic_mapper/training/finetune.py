@@ -6,8 +6,6 @@ are the same whatever the device. Kinds of fields that hold one scene are fitted
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence

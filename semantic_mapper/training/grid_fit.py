@@ -6,8 +6,6 @@ some (``fit_trunk``), then what is its own.
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ step looks at patches, not at whole images.
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

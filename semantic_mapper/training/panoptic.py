@@ -5,8 +5,6 @@ Pixels that show boxes that move are left out of the scene, and fill these boxes
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

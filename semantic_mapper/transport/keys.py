@@ -7,7 +7,6 @@ With keys all messages are encrypted, and both sides have proven who they are be
 
 from __future__ import annotations
 
-# pyright: reportUnknownMemberType=false
 import os
 import re
 import struct
