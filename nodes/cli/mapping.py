@@ -46,7 +46,7 @@ def map_(
     mapper: MapperSettings,
     options: HiddenSourceOptions,
     *,
-    out: Path | None = None,  # folder for the results [runs/NAME, or a new NAME-1, ...]
+    out: Path | None = None,  # folder for the results [a new runs/NAME]
     weights: WeightsOption = None,
     max_frames: MaxFramesOption = 0,
     rerun: Path | None = None,  # also a Rerun recording (.rrd)
