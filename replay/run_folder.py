@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shlex
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -92,7 +93,7 @@ def map_path(path: Path) -> Path:
     if path.is_dir() and (path / MAP_NAME).is_file():
         return path / MAP_NAME
     if is_log(path):
-        raise ConfigError(f"{path}: is a log; `semantic-mapper map {path} --out FOLDER` makes a map of it")
+        raise ConfigError(f"{path}: is a log; `semantic-mapper map {shlex.quote(str(path))}` makes a map of it")
     if not path.is_dir():
         return path
     maps = [*sorted(path.glob(f"*{MAP_SUFFIX}")), *sorted(path.glob(f"*/{MAP_NAME}"))]

@@ -34,7 +34,7 @@ def demo(
     mapper: MapperSettings,
     *,
     live: bool = False,  # map it again and again, as on a robot, and show it in a browser, until Ctrl-C
-    out: Path = Path("runs/demo"),  # folder for the results; made if missing
+    out: Path | None = None,  # folder for the results [runs/demo; runs/demo-live]; made if missing
     weights: WeightsOption = None,
 ) -> int:
     """Map a recorded log that comes with the package.
@@ -52,11 +52,11 @@ def demo(
     if live:
         given = bool(mapper.given or mapper.path)
         refuse_options((given, "--live", "has the settings of its launch file: `up camera` takes others"))
-        _run_live(output, out, weights)
+        _run_live(output, out or Path("runs/demo-live"), weights)
         return 0
     from semantic_mapper.replay.map_log import replay_log
 
-    began = time.monotonic()
+    began, out = time.monotonic(), out or Path("runs/demo")
     prepare_folder(out)
     with StopRequest() as stop:
         with frame_progress("map", None, stop=stop) as bar:

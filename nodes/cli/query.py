@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from semantic_mapper.client import UP, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
 from semantic_mapper.labels import PLAIN_NAMES
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -48,6 +49,7 @@ from semantic_mapper.replay.run_folder import map_path, prepare_file
 from semantic_mapper.transport.launches import is_running_mapper
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
+_log = get_logger(__name__)
 Up = tuple[float, float, float]
 Things = tuple[Instance, ...]
 Question = Literal["info", "at", "nearest", "instances", "graph", "relocalize"]
@@ -127,6 +129,8 @@ def query(
             output.print("nothing is certain enough to be listed; --unsure lists all candidates")
     output.json(found)
     if picture is not None:
+        if not found["floors"]:
+            raise MapError(f"{picture} is not drawn: {map_answers.NO_FLOOR}")
         output.print(f"written to {picture}")
     return code
 
@@ -169,18 +173,20 @@ def answer(
             return map_answers.answer_instances(axis, _instances(world_map, axis, gone, unsure))
         case _:  # the graph
             graph = GraphTracker(up).update(world_map) if saved else world_map.graph(up)
-            if picture is not None:
-                if not graph.floors:
-                    raise MapError(f"there is nothing to draw: {map_answers.NO_FLOOR}")
+            if picture is not None and graph.floors:
                 write_picture(picture, draw_graph("rooms, doors and objects", graph))
             return map_answers.answer_graph(graph)
 
 
 def _axis(world_map: MapClient | MapSnapshot, up: Up | None) -> Up:
     """As given; else of a saved map away from the floor, as in the graph; else z of the world."""
-    with suppress(MapError):
-        return up or (tuple(up_in(world_map).tolist()) if isinstance(world_map, MapSnapshot) else UP)
-    return UP
+    if up is not None or not isinstance(world_map, MapSnapshot):
+        return up or UP
+    try:
+        return tuple(up_in(world_map).tolist())
+    except MapError as error:
+        _log.warning("boxes_stand_along_z", reason=str(error))
+        return UP
 
 
 def _instances(world_map: MapClient | MapSnapshot, up: Up, gone: bool = False, unsure: bool = False) -> Things:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,7 +59,9 @@ def view(
     path = Path(source)
     saved = map_path(path) if source and is_map(path) else None
     if source and not saved and is_log(path):
-        raise ConfigError(f"{path}: is a log; `semantic-mapper map {path} --view` shows it while it is mapped")
+        raise ConfigError(
+            f"{path}: is a log; `semantic-mapper map {shlex.quote(str(path))} --view` shows it while it is mapped"
+        )
     refuse_options(
         (remote.server and "://" not in source, "--server", "goes with an endpoint such as tcp://robot:5570"),
     )

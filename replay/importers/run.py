@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
+
+import cv2
+import numpy as np
 
 from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
@@ -168,13 +172,23 @@ def _what_folder(src: Path) -> str:
     if len(_lacks(src, name)) < len(MARKS[name]):
         return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}{_SHOWN}"
     files = [*src.glob("*/*"), *src.glob("*/*/*")]
-    if films := sorted({file.parent for file in files if file.suffix.lower() in PICTURE_SUFFIXES}):
-        return _name_one("folders of pictures", films)
+    first = {file.parent: file for file in sorted(files, reverse=True) if file.suffix.lower() in PICTURE_SUFFIXES}
+    if films := sorted(folder for folder, file in first.items() if not _is_depth(file)):
+        if len(films) == len(first):
+            return _name_one("folders of pictures", films)
+        depth = ", ".join(str(folder) for folder in sorted(first) if folder not in films)
+        return f"holds depth ({depth}), but has no layout that is known{_SHOWN}; {films[0]} alone is a film"
     return f"is no recording of a known format ({', '.join(FORMATS)}){_SHOWN}"
 
 
+def _is_depth(picture: Path) -> bool:
+    image = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
+    return image is not None and image.dtype == np.uint16
+
+
 def _name_one(what: str, places: Sequence[Path]) -> str:
-    return f"holds {what}; name one of them: {', '.join(map(str, places[:LISTED]))} (`semantic-mapper map {places[0]}`)"
+    named = ", ".join(map(str, places[:LISTED]))
+    return f"holds {what}; name one of them: {named} (`semantic-mapper map {shlex.quote(str(places[0]))}`)"
 
 
 def _what_file(src: Path) -> str:

@@ -53,7 +53,9 @@ def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
     named = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name == FLOOR]
     floor = points.xyz[np.isin(points.label, named)].astype(np.float64)
     if len(floor) < max(LEAST_SHARE * len(points.xyz), 10):
-        raise MapError("which way is up cannot be found: too little of the map is labelled floor; say it with --up")
+        raise MapError(
+            "which way is up is not known: too little of the map is labelled floor; map more of it, or give `up`"
+        )
     rise = points.xyz.mean(axis=0, dtype=np.float64) - floor.mean(axis=0)
     guess = _normal(floor)
     up = find_upright(points.xyz, guess if rise @ guess > 0 else -guess)
@@ -64,8 +66,8 @@ def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
     up = find_upright(points.xyz, axis if rise @ axis > 0 else -axis)
     if _level_share(floor @ up) < LEVEL_SHARE:
         raise MapError(
-            f"which way is up cannot be found: what is labelled floor lies in no plane ({high - low:.2f} m of height); "
-            "say it with --up"
+            f"which way is up is not known: what is labelled floor lies in no plane ({high - low:.2f} m of height); "
+            "give `up`"
         )
     return up
 

@@ -34,7 +34,7 @@ FITTED = {
 }
 FRAMES, STEPS = 3, 20
 TOLD = {"loss": r"held-out loss (\d+\.\d+)", "db": r"held-out views (\d+\.\d+) dB"}
-ROUNDING = {"labels": 5, "depth_m": 1e-4, "confident": 5}
+ROUNDING = {"labels": 15, "depth_m": 1e-4, "confident": 5}  # one AMD EPYC gives 7 other pixels than another
 ROUNDING_OF_SMALL = {**ROUNDING, "labels": 40}  # half trained: an AMD EPYC gives 29 other pixels than an Intel Xeon
 ROUNDING_OF_FITS = {
     "labels": 70,

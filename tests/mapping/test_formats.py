@@ -151,7 +151,7 @@ def test_up_is_away_from_the_floor(up: tuple[float, float, float]) -> None:
 
 def test_no_up_is_better_than_a_wrong_one() -> None:
     room = a_room(np.eye(3))
-    with pytest.raises(MapError, match="too little of the map is labelled floor; say it with --up"):
+    with pytest.raises(MapError, match="too little of the map is labelled floor; map more"):
         find_up(room, LABELS)
     mixed = np.random.default_rng(4).permutation(room.label)
     with pytest.raises(MapError, match="in no plane"):

@@ -15,6 +15,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import answer, answer_table, open_saved
 from semantic_mapper.queries import instances
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.contract.entry_points import serving
@@ -23,6 +24,7 @@ from tests.mapping.rendered_views import small_map
 from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import refused, run, run_ok
+from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, house_changes, two_rooms
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
 
 
@@ -92,6 +94,13 @@ def test_instances_of_a_saved_map_stand_as_its_floor_says(tmp_path: Path) -> Non
     found = answer(open_saved(str(tmp_path)), "instances")
     np.testing.assert_allclose(found["up"], (1, 0, 0), atol=0.02)
     assert {thing["class"] for thing in found["instances"] if thing["voxels"] > 200} == {"table", "cup"}
+
+
+def test_without_a_floor_boxes_stand_along_z(capsys: pytest.CaptureFixture[str]) -> None:
+    walls = [box for box in two_rooms() if box[0] != "floor"]
+    snapshot = MapMirror(VOXEL_M, TRUNCATION, LABELS).apply(house_changes(walls, 0))
+    assert answer(snapshot, "instances")["up"] == [0, 0, 1]
+    assert "boxes_stand_along_z" in capsys.readouterr().err
 
 
 def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:

@@ -161,10 +161,18 @@ def test_formats_are_told_apart(folder: Path, tmp_path: Path) -> None:
     files = ("half/poses.txt", "film.MP4", "day.zip", "a.sens", "nice/traj.txt", "log.mcap", "above/film/left/1.jpg")
     for name in ("bag/metadata.yaml", "bag/day_0.db3", "day.bag", *files):
         (tmp_path / name).touch()
+    (tmp_path / "own" / "deep").mkdir(parents=True)
+    (tmp_path / "own" / "rgb").mkdir()
+    cv2.imwrite(str(tmp_path / "own" / "deep" / "1.png"), np.ones((4, 4), np.uint16))
+    cv2.imwrite(str(tmp_path / "own" / "rgb" / "1.png"), np.ones((4, 4, 3), np.uint8))
     for src, complaint in (
         ("nothing", "no recording of a known format"),
         (".", r"holds recordings; name one of them: .*bag, .*day.bag, .*kitchen \(`semantic-mapper map .*bag`\)"),
         ("above", r"holds folders of pictures; name one of them: .*left \(`semantic-mapper map .*above/film/left`\)"),
+        (
+            "own",
+            r"holds depth \(.*own/deep\), but has no layout .* shows the files of each format; .*own/rgb alone is a",
+        ),
         ("nothink", r"no such file or folder; did you mean `.*/nothing`\?"),
         ("hapf/color", r"no such file or folder; did you mean `.*/half/color`\?"),
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json; docs/layouts.md shows"),
