@@ -17,7 +17,7 @@ from typing import Any, TextIO
 import structlog
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -189,13 +189,11 @@ def frame_progress(
     """Show progress while inside; ``total`` None where nobody knows it. ``stop`` is what ends the job early."""
     columns = (
         TextColumn("{task.description}", "bold", markup=False),
-        BarColumn(),
+        BarColumn(20),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}", "cyan", markup=False),
         TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("elapsed"),
-        TimeElapsedColumn(),
+        TimeRemainingColumn(compact=True),
         TextColumn("{task.fields[note]}", markup=False),
     )
     console, log = stderr_console(), structlog.get_config()

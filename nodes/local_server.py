@@ -51,6 +51,8 @@ class LocalServer(ThreadingHTTPServer):
 
 
 def open_browser(url: str) -> None:
-    """Show a page in a browser of this desktop; without a desktop, as behind ssh, nothing happens."""
+    """Show a page in a browser of this desktop; without a desktop, as behind ssh, say where it is."""
     if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        webbrowser.open(url)  # else it would start a text browser in this terminal
+        webbrowser.open(url)
+    else:  # it would start a text browser in this terminal
+        _log.info("browser_not_opened", reason="no desktop", page=url)

@@ -345,4 +345,4 @@ def _write_report(
             folded={"Settings that were in force": json.dumps(summary["config"], indent=1)},
         ),
     ]
-    write_page(out / REPORT_NAME, f"Replay of {summary['source'] or 'a session'}", sections)
+    write_page(out / REPORT_NAME, f"Map of {summary['source'] or 'a session'}", sections)

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rerun as rr
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import LogError
@@ -23,7 +24,7 @@ from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
-from semantic_mapper.queries.graph import HUNG_NAMES, SceneGraph
+from semantic_mapper.queries.graph import HUNG_NAMES, Room, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.base import CameraPath
 from semantic_mapper.replay.rerun_layout import (
@@ -51,6 +52,7 @@ REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 NAMED, NAMED_M = 3, 0.4  # kinds of things that a room is called by; the least length of a thing with a name
+APART_M = 0.5  # two names; the larger thing has its own
 ROOM_COLOR, DOOR_RADIUS_M, DOT_RADIUS_M = (255, 255, 255), 0.06, 0.01
 GONE_COLOR = (150, 150, 150)
 
@@ -180,19 +182,24 @@ class RerunLog:
         self._up = graph.up
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
         self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR))
-        names, middles = room_names(graph), np.array([room.center for room in graph.rooms]).reshape(-1, 3)
-        self._log_names("world/graph/room_names", middles, names, ROOM_COLOR)
         doors = np.array([door.center for door in graph.doors]).reshape(-1, 3)
         widths = [f"door, {door.width_m:.2f} m" for door in graph.doors]
         self._stream.log("world/graph/doors", rr.Points3D(doors, radii=DOOR_RADIUS_M, colors=ROOM_COLOR, labels=widths))
         classes = [thing.class_id for thing in graph.things]
         self._log_boxes("things", graph.things, class_ids=classes, show_labels=False)
-        large = [thing for thing in graph.things if is_large(thing)]
+        large = sorted(filter(is_large, graph.things), key=lambda thing: -thing.box.size.prod())
         tops = [t.box.center + graph.up * (np.abs(t.box.R_world_box.T @ graph.up) @ t.box.size / 2) for t in large]
+        kept = list[int]()
+        for i, top in enumerate(tops):
+            if all(np.linalg.norm(top - tops[other]) > APART_M for other in kept):
+                kept.append(i)
+        large, tops = [large[i] for i in kept], np.array([tops[i] for i in kept]).reshape(-1, 3)
         tints = {i: (np.array(c) + 255) // 2 for i, c in zip(self._label_set.ids, self._label_set.colors, strict=True)}
         names = [thing.title for thing in large]
         colors = [tints[thing.class_id] for thing in large]  # brown would not be read on black
-        self._log_names("world/graph/thing_names", np.array(tops).reshape(-1, 3), names, colors)
+        self._log_names("world/graph/thing_names", tops, names, colors)
+        places = np.array([free_place(room, tops) for room in graph.rooms]).reshape(-1, 3)
+        self._log_names("world/graph/room_names", places, room_names(graph), ROOM_COLOR)
         left = [f"{thing.title}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
         self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
 
@@ -267,8 +274,15 @@ class RerunLog:
 
 
 def is_large(thing: Instance) -> bool:
-    """Whether it has its name on it: names of what is small, or a splinter, would cover others."""
-    return float(thing.box.size.max()) >= NAMED_M
+    """Whether it has its name on it: names of what is small, a splinter, or of no telling class would cover others."""
+    return float(thing.box.size.max()) >= NAMED_M and thing.class_name != "otherprop"
+
+
+def free_place(room: Room, names: Float64) -> Float64:
+    """Where on its floor a room's own name is farthest from other ``names`` (N, 3): (3,) in the middle, or half way to
+    its outline."""
+    places = np.concatenate((room.center[None], (room.center + room.outline) / 2))
+    return places[cdist(places, names).min(axis=1, initial=np.inf).argmax()]
 
 
 def room_names(graph: SceneGraph) -> list[str]:

@@ -45,7 +45,7 @@ def provide_browser() -> str:
         return ""
     if platform.system() != "Linux":
         return f"this is {platform.system()}"
-    return unpack_packages(("chromium-headless-shell",), TREE, "Chromium")
+    return unpack_packages(("chromium-headless-shell", "chromium-common"), TREE, "Chromium")
 
 
 class Browser:

@@ -91,5 +91,5 @@ def _show_live(stack: ExitStack, folder: Path) -> None:
     place = LIVE if len(running_launches()) == 1 else str(folder)
     console = stderr_console()
     console.print("the room is mapped again and again until Ctrl-C; meanwhile, in another terminal:", style="bold")
-    for words in (f"query {place} nearest chair 0 0 1", f"query {place} info", "view --status"):
+    for words in (f"query {place} nearest chair 0 0 1", f"query {place} info", f"view {place} --status"):
         console.print(f"  {program} {words}")

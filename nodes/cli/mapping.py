@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import ClassVar
@@ -74,7 +75,7 @@ def map_(
     usual = Path("runs") / source[0].resolve().stem
     if out is None and (out := free_name(usual) if is_map(usual) else usual) != usual:
         stderr_console().print(
-            f"{usual} holds a map: this one goes to {out}; --out {usual} replaces it", style="yellow"
+            f"{usual} holds a map: this one goes to {out}; --out {shlex.quote(str(usual))} replaces it", style="yellow"
         )
     if needs_import(source[0]):
         if len(source) > 1:

@@ -15,8 +15,8 @@ import typer
 from rich.table import Table
 
 from semantic_mapper.client import UP, MapClient
-from semantic_mapper.config import AtLeastOne, Fraction
-from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError
+from semantic_mapper.config import AtLeastOne, Fraction, nearest_path
+from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError, TransportError
 from semantic_mapper.labels import PLAIN_NAMES
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.map_file import describe_map
@@ -46,7 +46,7 @@ from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
 from semantic_mapper.replay.run_folder import map_path, prepare_file
-from semantic_mapper.transport.launches import is_running_mapper
+from semantic_mapper.transport.launches import is_running_mapper, launch_folder, running_launches
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 _log = get_logger(__name__)
@@ -137,7 +137,13 @@ def query(
 
 def open_saved(source: str) -> MapSnapshot:
     """A map file, or that of a folder of results."""
-    return MapMirror.load(map_path(Path(source))).snapshot()
+    path = Path(source)
+    if not path.exists() and running_launches():
+        try:
+            launch_folder(source)  # names those that run
+        except TransportError as error:
+            raise ConfigError(f"{path}: no such map file or folder{nearest_path(path)}; {error}") from error
+    return MapMirror.load(map_path(path)).snapshot()
 
 
 def answer(

@@ -94,4 +94,4 @@ with console.frame_progress("map", 2):
 structlog.get_logger("x").info("after")
 """
     shown = _python(code, FORCE_COLOR="1").stderr
-    assert "map_saved" not in shown and "left_out" in shown and "after" in shown and "elapsed" in shown
+    assert "map_saved" not in shown and "left_out" in shown and "after" in shown and "left" in shown

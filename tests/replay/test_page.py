@@ -77,7 +77,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_replay_leaves_a_report_with_its_figures_and_pictures(run: Path) -> None:
     page, summary = read_page(run / "report.html"), json.loads((run / "summary.json").read_text())
-    assert page.findtext("body/h1") == "Replay of <room> & hall"
+    assert page.findtext("body/h1") == "Map of <room> & hall"
     shown = cells(page)
     assert shown["frames: refused"] == ["1"] and shown["frames: scored"] == ["3"]
     assert shown["mIoU"] == [f"{summary['metrics']['miou'] * 100:.1f} %"]
