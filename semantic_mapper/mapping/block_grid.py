@@ -35,7 +35,7 @@ from semantic_mapper.mapping.blocks import (
     pack_keys,
     unpack_keys,
 )
-from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8, UInt16
 
 BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
@@ -53,13 +53,13 @@ _log = get_logger(__name__)
 
 
 class GridBuffers(NamedTuple):
-    """The grid's memory; growing replaces it. Voxels are (capacity, 512, ...) float32."""
+    """The grid's memory; growing replaces it. Voxels are (capacity, 512, ...) float32, evidence uint16."""
 
     keys: Int32  # (capacity, 3) block coordinates
     tsdf: Float32  # signed distance over truncation in [-1, 1]
     weight: Float32  # number of depth measurements (capped); below 1 the depth was computed
     color: Float32  # (..., 3) in 0..255
-    evidence: Float32  # (..., L) sum of log probabilities by weight
+    evidence: UInt16  # (..., L) mean of what votes say; see ``fusion``
     votes: Float32  # sum of vote weights
 
     @property
@@ -80,7 +80,7 @@ class BlockGrid:
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
         self.classes = classes
-        self.block_bytes = 4 * BLOCK_VOXELS * (1 + 1 + 3 + 1 + classes) + 12
+        self.block_bytes = BLOCK_VOXELS * (4 * (1 + 1 + 3 + 1) + 2 * classes) + 12
         self._max_resident = max_blocks
         if memory_bytes > 0:
             self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
@@ -361,7 +361,7 @@ class BlockGrid:
                 tsdf=_zeros(flat, np.float32),
                 weight=_zeros(flat, np.float32),
                 color=_zeros((*flat, 3), np.float32),
-                evidence=_zeros((*flat, self.classes), np.float32),
+                evidence=_zeros((*flat, self.classes), np.uint16),
                 votes=_zeros(flat, np.float32),
             )
         except OSError as error:

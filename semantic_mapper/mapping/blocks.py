@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.types import Bool, Float32, Int32, Int64
+from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt16
 
 KEY_BITS = 21
 KEY_LIMIT = 1 << (KEY_BITS - 1)  # |coordinate| must stay below: 167 km at 2 cm voxels
@@ -79,27 +79,27 @@ def _find_block_indices(index: BlockIndex, packed: Int64, found: Int32) -> None:
 
 
 class BlockValues(NamedTuple):
-    """The voxels of B blocks: (B, 512) float32, colour (B, 512, 3), evidence (B, 512, L)."""
+    """The voxels of B blocks: (B, 512) float32, colour (B, 512, 3), evidence (B, 512, L) uint16."""
 
     tsdf: Float32
     weight: Float32
     color: Float32
-    evidence: Float32
+    evidence: UInt16
     votes: Float32
 
 
 def empty_blocks(count: int, classes: int) -> BlockValues:
     """Blocks whose voxels are all zero."""
     flat = (count, BLOCK_VOXELS)
-    shapes = (flat, flat, (*flat, 3), (*flat, classes), flat)
-    return BlockValues(*(np.zeros(shape, np.float32) for shape in shapes))
+    tsdf, weight, votes = (np.zeros(flat, np.float32) for _ in range(3))
+    return BlockValues(tsdf, weight, np.zeros((*flat, 3), np.float32), np.zeros((*flat, classes), np.uint16), votes)
 
 
 class PackedBlocks(NamedTuple):
     """B blocks one behind the other: of each, two masks of 512 bits (of a byte, the highest first): voxels that are
-    measured, and that have votes; then TSDF, weight and colour of the first, evidence and votes of the second."""
+    measured, and that have votes; then TSDF, weight and colour of the first, votes and evidence of the second."""
 
-    data: Float32  # (N,) float32; of masks, the bits
+    data: Float32  # (N,) float32; of masks and evidence, the bits
     ends: Int64  # (B + 1,) where blocks begin and end in it
 
     def blobs(self) -> list[memoryview]:

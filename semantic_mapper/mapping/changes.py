@@ -1,4 +1,4 @@
-"""What changed in a map since a version, small enough to be sent: 3.1 KB a block instead of 12 KB and 2 KB a class.
+"""What changed in a map since a version, small enough to be sent: 3.1 KB a block instead of 12 KB and 1 KB a class.
 
 The TSDF is rounded to 1/127 of the truncation without ever changing its sign, so that the surface stays between the
 same voxels. Class evidence is decided where it lies: one class and its probability a voxel."""
@@ -17,7 +17,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockValues, PackedBlocks
-from semantic_mapper.mapping.fusion import MEASURED, SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import MEASURED, SURFACE_WEIGHT, evidence_of
 from semantic_mapper.types import Bool, Int32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
@@ -146,14 +146,15 @@ def received_parts(changes: BlockChanges, label_set: LabelSet) -> Iterator[tuple
         computed = 0 if changes.computed is None else changes.computed[part]
         weight = np.where(observed, np.where(computed, SURFACE_WEIGHT, MEASURED), 0).astype(np.float32)
         tsdf = np.where(observed, changes.tsdf[part] / np.float32(TSDF_STEPS), np.float32(0))
-        evidence = np.zeros((*label.shape, len(label_set)), np.float32)
         known = label != label_set.ignore_id
-        # The softmax of e for one of L classes, and 0 for the others, is p: e = log(p / (1 - p) * (L - 1)).
+        log_p = np.zeros((*label.shape, len(label_set)), np.float32)
+        # The softmax of 0 for one of L classes, and -e for the others, is p: e = log(p / (1 - p) * (L - 1)).
         p = np.clip(confidence[known], 0.5, CONFIDENCE_STEPS - 0.5) / CONFIDENCE_STEPS
         odds = p / (1 - p) * max(1, len(label_set) - 1)
-        evidence[(*np.nonzero(known), label_set.to_channels(label[known]))] = np.log(np.maximum(odds, 1.001))
+        log_p[known] = -np.log(np.maximum(odds, 1.001))[:, None]
+        log_p[(*np.nonzero(known), label_set.to_channels(label[known]))] = 0
         color, votes = changes.rgb[part].astype(np.float32), known.astype(np.float32)
-        yield changes.keys[part], BlockValues(tsdf, weight, color, evidence, votes)
+        yield changes.keys[part], BlockValues(tsdf, weight, color, evidence_of(log_p), votes)
 
 
 # Serial: it runs next to the mapper, which needs the other threads.

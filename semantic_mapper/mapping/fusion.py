@@ -1,8 +1,8 @@
 """Fusion of one frame in one compiled pass over the blocks it touches: TSDF, colour and class evidence together.
 
-TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the sum over frames of ``w * log p``
-at the pixel a voxel projects to: one vote a voxel a frame, only near the surface. ``w`` (0..1) trusts near and frontal
-looks more; see ``make_votes``. The result does not depend on threads.
+TSDF and colour are the running means of Open3D's ``integrate``. Class evidence is the mean by weight of ``-log p`` at
+the pixel a voxel projects to: one vote a voxel a frame, only near the surface. The weight (0..1) trusts near and
+frontal looks more; see ``make_votes``. The result does not depend on threads.
 
 Depth of a sensor weighs ``MEASURED`` in the TSDF; computed depth at most ``COMPUTED_LOOK``, and all of it together at
 most ``COMPUTED_CAP``: so the weight of a voxel says whether its surface was measured. Computed depth never changes what
@@ -22,13 +22,14 @@ from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.allocation import Camera
 from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.clearing import NO_BOUNDS, DepthBounds, FusionLimits, Scene
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, Int64, UInt16
 
 MEASURED = 1.0
 COMPUTED_LOOK = 1 / 32
 COMPUTED_CAP = 31 / 32
 SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surface: four sure looks, or more unsure ones
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
+EVIDENCE_STEPS = 4096  # a nat: evidence is a whole number of such steps, below 16 nats
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
 
 
@@ -47,7 +48,7 @@ def make_limits(config: VoxelMapConfig) -> FusionLimits:
 class Votes(NamedTuple):
     """What a frame says of classes."""
 
-    log_p: Float32  # (K, L) log probabilities, floored
+    evidence: UInt16  # (K, L) ``evidence_of`` probabilities, floored
     rows: Int32  # (H, W) which row each pixel takes; looked at only where ``weights`` > 0
     weights: Float32  # (H, W) in 0..1
 
@@ -58,11 +59,16 @@ def make_votes(
     """Votes of a frame, each of weight ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due; and how many known
     pixels hold what is no probability. Rows of ``probabilities`` (K, L) by pixel: ``rows`` (H, W) int32, -1 = unknown;
     ``depth`` (H, W) in metres."""
-    log_p, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
-    _log_probability_rows(len(probabilities), probabilities, log_p, proper)
+    evidence, proper = np.empty(probabilities.shape, np.uint16), np.empty(len(probabilities), np.bool_)
+    _evidence_of_rows(len(probabilities), probabilities, evidence, proper)
     weights, bad = np.empty(depth.shape, np.float32), np.empty(len(depth), np.int64)
     _vote_weights(len(depth), depth, rows, proper, camera, depth_max, weights, bad)
-    return Votes(log_p, rows, weights), int(bad.sum())
+    return Votes(evidence, rows, weights), int(bad.sum())
+
+
+def evidence_of(log_p: Float32) -> UInt16:
+    """Evidence (..., L) as it is stored, of log probabilities (..., L): ``-log_p`` in steps, 16 nats at most."""
+    return np.rint(np.clip(-EVIDENCE_STEPS * log_p, 0, 65535)).astype(np.uint16)
 
 
 def checked_depth(
@@ -141,8 +147,8 @@ def fuse_blocks(
 
 
 @parallel_kernel()
-def _log_probability_rows(count: int, probabilities: Float32, logs: Float32, proper: Bool) -> None:
-    """Floored log of rows (K, L), and whether each (K,) is of numbers that are not negative and sum to 1."""
+def _evidence_of_rows(count: int, probabilities: Float32, evidence: UInt16, proper: Bool) -> None:
+    """Evidence of rows (K, L), floored, and whether each (K,) is of numbers that are not negative and sum to 1."""
 
 
 @parallel_kernel()

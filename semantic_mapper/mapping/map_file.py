@@ -34,7 +34,7 @@ from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Int32, Int64
 
 FORMAT = "semantic-mapper voxel map"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
 ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper map`"
 
@@ -56,7 +56,7 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "tsdf": "<f4",  # (M,)
     "weight": "<f4",  # (M,)
     "color": "<f4",  # (M, 3)
-    "evidence": "<f4",  # (V, L)
+    "evidence": "<u2",  # (V, L)
     "votes": "<f4",  # (V,)
 }
 _PLACES = {  # of ``Place``; only where there are any

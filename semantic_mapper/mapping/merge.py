@@ -1,7 +1,7 @@
 """Adding the voxels of one map to another: sums of what both have measured, resampled where their voxels differ.
 
-Weights, evidence and votes are sums, TSDF and colour means by weight; the caps are those of fusion, except that where
-votes pass theirs, old and new fade alike. Maps whose voxels do not coincide are interpolated first, between the eight
+Weights and votes are sums, the rest means by weight or by votes; the caps are those of fusion, except that where votes
+pass theirs, old and new fade alike. Maps whose voxels do not coincide are interpolated first, between the eight
 voxels around each new one, over those that were observed and only where these outweigh the others. Across a depth edge
 the nearest voxel is taken: in between there would be a surface that nobody saw."""
 

@@ -21,9 +21,9 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.blocks import find_blocks, pack_keys
 from semantic_mapper.mapping.floor_plan import find_up
-from semantic_mapper.mapping.fusion import PROBABILITY_FLOOR, SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion import EVIDENCE_STEPS, PROBABILITY_FLOOR, SURFACE_WEIGHT, evidence_of
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64
+from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt16
 
 TILE_M = 8.0
 OVERLAP_M = 1.9
@@ -31,7 +31,6 @@ LARGEST_VOXEL_M = 0.06  # the network knows cells of 4 cm
 BAND_VOXELS = 2.0  # voxels this near the surface are filled, as near as votes reach
 FILL_VOTES = 0.3  # of what is filled: later votes of frames outweigh it
 FILL = 0.5
-LEAST_LOG = np.float32(-30)  # of a probability that is written
 ANSWERED_AT_ONCE = 65_536
 LOW_PERCENT = 1.0  # of the surface's points that lie below the floor, by noise
 
@@ -78,7 +77,7 @@ class _Written(NamedTuple):
     column: int
     key: Int32
     at: Int64
-    evidence: Float32
+    evidence: UInt16
     votes: Float32
 
 
@@ -178,8 +177,7 @@ def surface_voxels(voxel_map: VoxelMap, frame: UpFrame, low: Int64, high: Int64)
         core = near[row, at] & (sdf[row, at] * config.voxel_size_m <= max(CELL_M / 2, config.voxel_size_m))
         rise = _gradients(grid, keys, blocks, row, at) @ frame.R[2].astype(np.float32)
         color, votes = buffers.color[blocks[row], at], buffers.votes[blocks[row], at]
-        said = buffers.evidence[blocks[row], at]
-        said *= (_effective(votes, config.vote_discount) / np.maximum(votes, np.float32(1e-6)))[:, None]
+        said = buffers.evidence[blocks[row], at] * (_effective(votes, config.vote_discount) / -EVIDENCE_STEPS)[:, None]
         said -= said.max(axis=1, keepdims=True)
         said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
         log_p = np.where(votes[:, None] > 0, said, 0).astype(np.float32)
@@ -227,7 +225,6 @@ def _refine_tile(
     after = before.copy()
     after[:, mine] = together + said
     after[np.ix_(~voted, np.setdiff1d(np.arange(before.shape[1]), mine))] = np.log(PROBABILITY_FLOOR)
-    after = np.maximum(after, LEAST_LOG)
     filled = ~voted & reached & (np.exp(said.max(axis=1)) >= fill) & (fill < 1)
     changed = (voted & reached) | filled
     core = voxels.core[own]
@@ -235,8 +232,8 @@ def _refine_tile(
     new = np.where(changed, after.argmax(axis=1), old)
     np.add.at(counts, (old[core], new[core]), 1)
     votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
-    evidence = after[changed] * (votes / _effective(votes, voxel_map.config.vote_discount))[:, None]
-    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence.astype(np.float32), votes)
+    evidence = evidence_of(after[changed] / _effective(votes, voxel_map.config.vote_discount)[:, None])
+    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence, votes)
 
 
 def _read_answer(

@@ -3,9 +3,10 @@
 Open3D's own ``ray_cast`` is off by half a voxel and can crash; this one walks from block to block, steps by the TSDF
 and finds the zero crossing on the interpolated field. Points are read by interpolation over the eight voxels around.
 
-With n votes of evidence e, ``p = softmax(e * n_eff / n)``, where ``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of
-one place repeat each other's errors, so a hundred of them are worth at most 1 / rho independent ones; else n_eff = 1.
-The label is the argmax, its confidence p[label]. Below ``unknown_below`` the label is unknown, the confidence stays."""
+With n votes that say ``log p`` on average, ``p = softmax(n_eff log p)``, where ``n_eff = n / (1 + rho (n - 1))``
+for n > 1: views of one place repeat each other's errors, so a hundred of them are worth at most 1 / rho independent
+ones; else n_eff = 1. The label is the argmax, its confidence p[label]. Below ``unknown_below`` the label is unknown,
+the confidence stays."""
 
 from __future__ import annotations
 

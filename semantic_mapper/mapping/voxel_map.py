@@ -154,7 +154,7 @@ class VoxelMap:
         depth, weights = checked_depth(depth_m, trust, frame.intrinsics, where)
         camera, classes = make_camera(frame.intrinsics, frame.T_world_camera), len(self.label_set)
         with _KERNEL_LOCK:
-            votes = Votes(np.zeros((1, classes), np.float32), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
+            votes = Votes(np.zeros((1, classes), np.uint16), np.zeros(depth.shape, np.int32), np.zeros_like(depth))
             if probabilities is not None:
                 of_map = camera, self.config.depth_max_m, classes, where
                 votes = frame_votes(depth, probabilities, known, rows, weights, *of_map)
@@ -258,7 +258,7 @@ class VoxelMap:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
         keys (B, 3) int32, by default in lexicographic order; tsdf, weight, votes (B, 8, 8, 8), color (B, 8, 8, 8, 3)
-        and evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x]."""
+        float32, evidence (B, 8, 8, 8, L) uint16 (``fusion.evidence_of``); voxels in the order [z][y][x]."""
         with _KERNEL_LOCK:
             keys = self._grid.all_keys() if keys is None else keys
             values = self._grid.read(pack_keys(keys))

@@ -8,6 +8,7 @@ import numpy as np
 
 from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.blocks import BlockIndex, make_block_index
+from semantic_mapper.mapping.fusion import EVIDENCE_STEPS, evidence_of
 from semantic_mapper.types import Float64
 
 
@@ -21,10 +22,9 @@ def random_grid(rng: np.random.Generator, classes: int = 4) -> tuple[BlockIndex,
     weight = np.where(rng.random((n, 512)) < 0.8, rng.uniform(0.5, 9, (n, 512)), 0).astype(np.float32)
     votes = np.where((weight > 0) & (rng.random((n, 512)) < 0.8), rng.uniform(0.1, 5, (n, 512)), 0).astype(np.float32)
     said = np.log(rng.dirichlet(np.full(classes, 0.5), (n, 512)) + 1e-4)
-    stored = said * votes[..., None]
-    stored[votes == 0] = 0
+    stored = evidence_of(np.where(votes[..., None] > 0, said, 0))
     color = (rng.uniform(0, 255, (n, 512, 3)) * (weight > 0)[..., None]).astype(np.float32)
-    buffers = GridBuffers(keys, tsdf, weight, color, stored.astype(np.float32), votes)
+    buffers = GridBuffers(keys, tsdf, weight, color, stored, votes)
     return make_block_index(keys, np.arange(n, dtype=np.int32)), buffers
 
 
@@ -45,7 +45,7 @@ def decided(evidence: np.ndarray, votes: float, rho: float, unknown_below: float
     """Channel and confidence of one voxel (L,); (-1, 0) without votes, channel -1 below ``unknown_below``."""
     if votes <= 0:
         return -1, 0.0
-    worth = 1 / (1 + rho * (votes - 1)) if votes > 1 else 1 / votes
-    p = np.exp((evidence - evidence.max()).astype(np.float64) * worth)
+    worth = votes / (1 + rho * (votes - 1)) if votes > 1 else 1.0
+    p = np.exp((evidence.min() - evidence.astype(np.float64)) * worth / EVIDENCE_STEPS)
     confidence = float(1 / p.sum())
-    return (int(evidence.argmax()) if confidence >= unknown_below else -1), confidence
+    return (int(evidence.argmin()) if confidence >= unknown_below else -1), confidence

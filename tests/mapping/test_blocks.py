@@ -40,7 +40,7 @@ def some_blocks(count: int, seed: int = 0) -> BlockValues:
         return np.where(mask.reshape(*mask.shape, *(1 for _ in tail)), values, np.float32(0))
 
     weight, votes = np.abs(of(measured)) + measured, np.abs(of(voted)) + voted
-    said = of(voted, CLASSES)
+    said = (4096 * np.abs(of(voted, CLASSES))).astype(np.uint16)
     return BlockValues(of(measured), weight.astype(np.float32), of(measured, 3), said, votes.astype(np.float32))
 
 

@@ -66,7 +66,7 @@ def test_a_full_disk_is_told_and_the_old_map_stays(maps: list[Path], tmp_path: P
 
 CLASSES = 20
 LABELS = make_label_set("many", tuple(f"class {i}" for i in range(CLASSES)), ids=tuple(range(1, CLASSES + 1)))
-BLOCK_BYTES = 4 * BLOCK_VOXELS * (CLASSES + 6)
+BLOCK_BYTES = BLOCK_VOXELS * (2 * CLASSES + 4 * 6)
 CHUNKS = 20
 MAP_BYTES = CHUNKS * CHUNK_BLOCKS * BLOCK_BYTES
 MEMORY_MB = 25
@@ -78,8 +78,8 @@ def a_part(x: int) -> BlockPart:
     y, z = np.divmod(np.arange(CHUNK_BLOCKS, dtype=np.int32), 16)
     keys = np.stack((np.full_like(y, x), y, z), axis=1)
     held = rng.random((CHUNK_BLOCKS, BLOCK_VOXELS)) < 0.03
-    channels = (1, 1, 3, CLASSES, 1)
-    values = [(held[..., None] * (1 + rng.random(n))).astype(np.float32) for n in channels]
+    channels = ((1, "f4"), (1, "f4"), (3, "f4"), (CLASSES, "u2"), (1, "f4"))
+    values = [(held[..., None] * (1 + 9 * rng.random(n))).astype(dtype) for n, dtype in channels]
     return keys, BlockValues(*(value[..., 0] if value.shape[2] == 1 else value for value in values))
 
 
@@ -93,7 +93,7 @@ def manifest(labels: LabelSet = LABELS) -> MapManifest:
 
 @pytest.fixture(scope="module")
 def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of 270 MB; ``small.npz`` beside it is of 1 chunk."""
+    """A map of 170 MB; ``small.npz`` beside it is of 1 chunk."""
     path = tmp_path_factory.mktemp("building") / "map.npz"
     write_map(path, manifest(), parts(CHUNKS))
     write_map(path.with_name("small.npz"), manifest(), parts(1))

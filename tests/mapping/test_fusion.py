@@ -15,6 +15,7 @@ from semantic_mapper.mapping.clearing import Scene
 from semantic_mapper.mapping.fusion import (
     COMPUTED_CAP,
     COMPUTED_LOOK,
+    EVIDENCE_STEPS,
     MEASURED,
     PROBABILITY_FLOOR,
     Votes,
@@ -54,7 +55,8 @@ def test_votes_weigh_what_plain_numpy_says(rng: np.random.Generator) -> None:
     votes, bad = make_votes(p, rows, depth, CAMERA, 5.0)
     proper = np.ones(50, bool)
     proper[[3, 7, 9]] = False
-    np.testing.assert_allclose(votes.log_p[proper], np.log(np.maximum(p[proper], PROBABILITY_FLOOR)), rtol=1e-6)
+    log_p = np.log(np.maximum(p[proper], PROBABILITY_FLOOR))
+    np.testing.assert_allclose(votes.evidence[proper], -EVIDENCE_STEPS * log_p, atol=0.51)
     z = depth.astype(np.float64)
     v, u = np.indices(SIZE)
     x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -102,14 +104,11 @@ def seen_voxels(keys: np.ndarray, depth: Float32, behind: float) -> Seen:
 
 
 def vote(expected: np.ndarray, votes: np.ndarray, seen: Seen, given: Votes, chosen: np.ndarray) -> None:
-    """Add votes to sums of log probabilities, with the cap."""
+    """Add votes to means of what votes say, with the cap."""
     at, pixel = tuple(a[chosen] for a in seen.at), tuple(a[chosen] for a in seen.pixel)
     weight = given.weights[pixel].astype(np.float64)
-    old = votes[at].astype(np.float64)
-    over = old + weight > LIMITS.max_weight
-    keep = np.where(over, (LIMITS.max_weight - weight) / np.maximum(old, 1e-9), 1.0)
-    expected[at] = expected[at] * keep[:, None] + weight[:, None] * given.log_p[given.rows[pixel]]
-    votes[at] = np.where(over, LIMITS.max_weight, old + weight)
+    votes[at] = np.minimum(votes[at].astype(np.float64) + weight, LIMITS.max_weight)
+    expected[at] += (weight / votes[at])[:, None] * (given.evidence[given.rows[pixel]] - expected[at])
 
 
 def copy(buffers: GridBuffers) -> GridBuffers:
@@ -130,7 +129,7 @@ def test_a_fused_frame_is_that_of_plain_numpy(trusted: bool, measured: bool, rng
     votes = some_votes(rng, depth)
     trust = rng.uniform(0.1, 1, SIZE).astype(np.float32) if trusted else np.empty((0, 0), np.float32)
     fuse_blocks(blocks, buffers, Scene(CAMERA, LIMITS, depth, rgb), trust, votes, measured=measured)
-    expected, sums = copy(before), before.evidence.astype(np.float64)
+    expected, means = copy(before), before.evidence.astype(np.float64)
     seen = seen_voxels(before.keys[blocks], depth, LIMITS.truncation)
     seen = seen._replace(at=(blocks[seen.at[0]], seen.at[1]))
     assert len(seen.distance) > 500
@@ -147,14 +146,14 @@ def test_a_fused_frame_is_that_of_plain_numpy(trusted: bool, measured: bool, rng
     assert (expected.weight[at] == cap).any()
     chosen = (votes.weights[seen.pixel] > 0) & (np.abs(seen.distance) <= LIMITS.vote_band)
     assert chosen.sum() > 200
-    vote(sums, expected.votes, seen, votes, chosen)
+    vote(means, expected.votes, seen, votes, chosen)
     for name in ("tsdf", "weight", "color", "votes"):
         np.testing.assert_allclose(getattr(buffers, name), getattr(expected, name), rtol=2e-5, atol=2e-5, err_msg=name)
     kept = np.ones(before.weight.shape, np.bool_)
     kept[at] = False
     for name in ("tsdf", "weight", "color"):
         assert getattr(buffers, name)[kept].tobytes() == getattr(before, name)[kept].tobytes(), name
-    np.testing.assert_allclose(buffers.evidence, sums, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(buffers.evidence, means, atol=0.51)
 
 
 def test_votes_alone_go_to_measured_voxels_with_few_votes(rng: np.random.Generator) -> None:
@@ -162,13 +161,13 @@ def test_votes_alone_go_to_measured_voxels_with_few_votes(rng: np.random.Generat
     before, blocks, depth = copy(buffers), np.arange(9, dtype=np.int32), some_depth(rng)
     votes, few = some_votes(rng, depth), 2.0
     vote_into_blocks(9, blocks, buffers, CAMERA, LIMITS, depth, votes, few)
-    sums, total = before.evidence.astype(np.float64), before.votes.copy()
+    means, total = before.evidence.astype(np.float64), before.votes.copy()
     seen = seen_voxels(before.keys, depth, LIMITS.vote_band)
     chosen = (votes.weights[seen.pixel] > 0) & (np.abs(seen.distance) <= LIMITS.vote_band)
     chosen &= (before.weight[seen.at] > 0) & (before.votes[seen.at] < few)
     assert chosen.sum() > 100
-    vote(sums, total, seen, votes, chosen)
+    vote(means, total, seen, votes, chosen)
     np.testing.assert_allclose(buffers.votes, total, rtol=1e-5)
-    np.testing.assert_allclose(buffers.evidence, sums, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(buffers.evidence, means, atol=0.51)
     for name in ("tsdf", "weight", "color"):
         assert getattr(buffers, name).tobytes() == getattr(before, name).tobytes()

@@ -58,7 +58,7 @@ def test_a_map_is_described_without_its_blocks(saved: tuple[VoxelMap, Path]) -> 
     found = describe_map(path)
     state = voxel_map.block_state()
     corners = np.stack((state["keys"].min(axis=0), state["keys"].max(axis=0) + 1)) * (8 * 0.03)
-    assert (found.version, found.frames, found.last_stamp_ns, found.blocks) == (3, 3, 1002, voxel_map.block_count)
+    assert (found.version, found.frames, found.last_stamp_ns, found.blocks) == (4, 3, 1002, voxel_map.block_count)
     assert (found.config, found.label_set) == (voxel_map.config, LABELS)
     np.testing.assert_allclose(np.array(found.bounds_m), corners, rtol=0, atol=1e-9)
     assert sum(chunk.measured for chunk in found.chunks) == (state["weight"] > 0).sum()

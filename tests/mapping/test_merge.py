@@ -57,8 +57,8 @@ def test_two_halves_make_the_map_of_the_whole(halves: tuple[VoxelMap, VoxelMap])
     np.testing.assert_array_equal(state["keys"], whole["keys"])
     np.testing.assert_array_equal(state["weight"], whole["weight"])
     assert whole["weight"].max() > 4, "frames overlap"
-    for name, tolerance in (("tsdf", 2e-6), ("color", 2e-4), ("votes", 2e-6), ("evidence", 2e-5)):
-        np.testing.assert_allclose(state[name], whole[name], atol=tolerance, err_msg=name)
+    for name, tolerance in (("tsdf", 2e-6), ("color", 2e-4), ("votes", 2e-6), ("evidence", 3)):
+        np.testing.assert_allclose(state[name].astype(float), whole[name], atol=tolerance, err_msg=name)
     assert same(before[0], a.block_state()) and same(before[1], b.block_state()), "merging changes neither"
     assert len(joined.changes(0).keys) == joined.block_count
 
@@ -102,7 +102,7 @@ def test_maps_that_do_not_fit_are_refused(halves: tuple[VoxelMap, VoxelMap]) -> 
 def test_resampled_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> None:
     index, buffers = random_grid(rng)
     T = turned((20.0, -35.0, 50.0), (0.6, -2.3, 1.9))
-    R, t, sums = np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), buffers.evidence
+    R, t = np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy()
     keys = np.array([[0, 0, 0], [-1, 0, -1]], np.int32)
     moved = empty_blocks(2, 4)
     merge._resample_blocks(2, keys, R, t, index, buffers, moved)
@@ -131,9 +131,9 @@ def test_resampled_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> 
         votes, said = 0.0, np.zeros(4)
         if voted and fraction >= 0.5 * total:
             votes = sum(f * buffers.votes[at] for f, at in voted) / fraction
-            said = sum(f * sums[at] for f, at in voted) / fraction
+            said = sum(f * buffers.votes[at] * buffers.evidence[at] for f, at in voted) / (votes * fraction)
         np.testing.assert_allclose(moved.votes[n, voxel], votes, rtol=1e-5)
-        np.testing.assert_allclose(moved.evidence[n, voxel], said, rtol=1e-5)
+        np.testing.assert_allclose(moved.evidence[n, voxel], said, atol=0.51)
 
 
 def test_added_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> None:
@@ -154,12 +154,10 @@ def test_added_voxels_are_those_of_plain_numpy(rng: np.random.Generator) -> None
         mean = np.where(new[tail], (mine[tail] * a + theirs[tail] * b) / weight[tail], a)
         np.testing.assert_allclose(getattr(buffers, name)[blocks], mean, rtol=1e-5, atol=1e-6)
     votes = before.votes[blocks].astype(float) + added.votes
-    new = added.votes > 0
-    keep = np.where(new, np.minimum(1.0, cap / np.maximum(votes, 1e-9)), 1.0)
-    np.testing.assert_allclose(buffers.votes[blocks], votes * keep, rtol=1e-6)
-    said = (before.evidence[blocks] + added.evidence * new[..., None]) * keep[..., None]
-    step = 1e-5
-    np.testing.assert_allclose(buffers.evidence[blocks], said, rtol=1e-5, atol=0.51 * step)
+    np.testing.assert_allclose(buffers.votes[blocks], np.minimum(votes, cap), rtol=1e-6)
+    fraction = (added.votes / np.maximum(votes, 1e-9))[..., None]
+    said = (1 - fraction) * before.evidence[blocks] + fraction * added.evidence
+    np.testing.assert_allclose(buffers.evidence[blocks], said, atol=0.51)
     untouched = np.setdiff1d(np.arange(9), blocks)
     for now, then in zip(buffers, before, strict=True):
         assert now[untouched].tobytes() == then[untouched].tobytes()

@@ -13,6 +13,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError, WeightsError
 from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights, smoothed_votes
 from semantic_mapper.labels import NYU40, ROOMS, LabelSet, make_label_set
+from semantic_mapper.mapping.fusion import EVIDENCE_STEPS
 from semantic_mapper.mapping.refine import FILL_VOTES, check_refinable, refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import decided
@@ -77,7 +78,7 @@ def test_tiles_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen[0] > 2
     a, b = whole.block_state(), tiled.block_state()
     np.testing.assert_array_equal(a["votes"], b["votes"])
-    np.testing.assert_allclose(a["evidence"], b["evidence"], atol=1e-3)
+    np.testing.assert_allclose(a["evidence"].astype(float), b["evidence"], atol=4)
 
 
 def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_path: Path) -> None:
@@ -118,13 +119,13 @@ def test_by_name_leaves_the_probability_of_other_classes_alone() -> None:
     assert voxel_map.label_set == ROOMS
     changed = (before["votes"] > 0) & (before["evidence"] != after["evidence"]).any(axis=-1)
     votes = before["votes"][changed][:, None].astype(np.float64)
-    worth = np.where(votes > 1, 1 / (1 + 0.75 * (votes - 1)), 1 / votes)
+    worth = np.where(votes > 1, votes / (1 + 0.75 * (votes - 1)), 1)
 
     def read(state: dict) -> np.ndarray:
-        e = np.exp(state["evidence"][changed] * worth)
+        e = np.exp(state["evidence"][changed] * worth / -EVIDENCE_STEPS)
         return e / e.sum(axis=1, keepdims=True)
 
     p, q = read(before), read(after)
     assert len(p) > 100
-    np.testing.assert_allclose(p[:, 2:], q[:, 2:], atol=1e-5)
+    np.testing.assert_allclose(p[:, 2:], q[:, 2:], atol=3e-4)
     assert np.abs(p[:, :2] - q[:, :2]).max() > 0.05

@@ -14,7 +14,7 @@ from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.fusion import MEASURED
 from semantic_mapper.mapping.surface import read_points
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from tests.mapping.grids import corners, random_grid
+from tests.mapping.grids import corners, decided, random_grid
 from tests.mapping.rendered_views import (
     INTRINSICS,
     around,
@@ -143,11 +143,7 @@ def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:
 
 def test_points_are_read_as_plain_numpy_reads_them(rng: np.random.Generator) -> None:
     index, buffers = random_grid(rng)
-    labels, rho, sums = (
-        make_label_set("four", ("a", "b", "c", "d"), ids=(7, 1, 4, 2), ignore_id=0),
-        0.4,
-        buffers.evidence.astype(np.float64),
-    )
+    labels, rho = make_label_set("four", ("a", "b", "c", "d"), ids=(7, 1, 4, 2), ignore_id=0), 0.4
     points = rng.uniform(-12, 18, (400, 3))
     points[::5] = np.round(points[::5])  # at voxels: the others count nothing
     rgb, channel, confidence, measured = read_points(points, index, buffers, rho, 0.0)
@@ -166,14 +162,11 @@ def test_points_are_read_as_plain_numpy_reads_them(rng: np.random.Generator) -> 
         if not voted:
             assert (label[n], confidence[n]) == (0, 0.0)
             continue
-        total, votes = (
-            sum(f * sums[at] for f, at in voted) / fraction,
-            sum(f * buffers.votes[at] for f, at in voted) / fraction,
-        )
-        worth = 1 / (1 + rho * (votes - 1)) if votes > 1 else 1 / votes
-        p_class = np.exp((total - total.max()) * worth)
-        assert label[n] == labels.ids[int(total.argmax())]
-        assert confidence[n] == pytest.approx(p_class.max() / p_class.sum(), rel=1e-5)
+        votes = sum(f * buffers.votes[at] for f, at in voted)
+        said = sum(f * buffers.votes[at] * buffers.evidence[at] for f, at in voted) / votes
+        best, sure = decided(said, votes / fraction, rho)
+        assert label[n] == labels.ids[best]
+        assert confidence[n] == pytest.approx(sure, rel=1e-5)
 
 
 def test_points_beyond_all_numbers_do_no_harm_and_unknown_ones_are_unknown(rng: np.random.Generator) -> None:

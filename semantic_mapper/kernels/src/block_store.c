@@ -18,7 +18,7 @@ KERNEL(packed_block_ends, PackedEndsArguments) {
             measured += weight[voxel] > 0;
             voted += votes[voxel] > 0;
         }
-        a->ends.data[n + 1] = a->ends.data[n] + MASK_FLOATS + 5 * measured + (a->classes + 1) * voted;
+        a->ends.data[n + 1] = a->ends.data[n] + packed_floats(measured, voted, a->classes);
     }
     return 0;
 }
@@ -48,7 +48,7 @@ KERNEL(pack_block_values, PackArguments) {
         float *data = a->data.data + a->ends.data[n];
         int64_t measured = write_mask(values->weight.data + first, (uint8_t *)data);
         int64_t voted = write_mask(values->votes.data + first, (uint8_t *)data + MASK_BYTES);
-        PackedBlock block = packed_parts(data, measured, voted, classes);
+        PackedBlock block = packed_parts(data, measured, voted);
         for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
             int64_t at = first + voxel;
             if (in_mask(block.measured, voxel)) {
@@ -57,7 +57,7 @@ KERNEL(pack_block_values, PackArguments) {
                 for (int c = 0; c < 3; c++) *block.color++ = values->color.data[3 * at + c];
             }
             if (in_mask(block.voted, voxel)) {
-                memcpy(block.evidence, values->evidence.data + at * classes, (size_t)classes * sizeof(float));
+                memcpy(block.evidence, values->evidence.data + at * classes, (size_t)classes * sizeof(uint16_t));
                 *block.votes++ = values->votes.data[at];
                 block.evidence += classes;
             }
@@ -89,7 +89,7 @@ KERNEL(unpack_block_values, UnpackArguments) {
                 for (int c = 0; c < 3; c++) values->color.data[3 * at + c] = *block.color++;
             }
             if (in_mask(block.voted, voxel)) {
-                memcpy(values->evidence.data + at * classes, block.evidence, (size_t)classes * sizeof(float));
+                memcpy(values->evidence.data + at * classes, block.evidence, (size_t)classes * sizeof(uint16_t));
                 values->votes.data[at] = *block.votes++;
                 block.evidence += classes;
             }

@@ -8,21 +8,23 @@
 #define LEAST_COSINE 0.2f
 
 typedef struct {
-    F32 probabilities, logs; /* (K, L) */
-    U8 proper;               /* (K,) bool */
-} LogRowsArguments;
+    F32 probabilities; /* (K, L) */
+    U16 evidence;      /* (K, L) to fill */
+    U8 proper;         /* (K,) bool to fill */
+} EvidenceArguments;
 
-/* Floored log of rows, and whether each is of numbers that are not negative and sum to 1. */
-KERNEL(log_probability_rows, LogRowsArguments) {
+/* What rows say as evidence, and whether each is of numbers that are not negative and sum to 1. */
+KERNEL(evidence_of_rows, EvidenceArguments) {
     int64_t classes = a->probabilities.shape[1];
     for (int64_t n = start; n < stop; n++) {
         const float *row = a->probabilities.data + n * classes;
-        float *logs = a->logs.data + n * classes, least = 0.0f;
+        uint16_t *evidence = a->evidence.data + n * classes;
+        float least = 0.0f;
         double total = 0.0;
         for (int64_t c = 0; c < classes; c++) {
             total += row[c];
             least = min_f(least, row[c]);
-            logs[c] = logf(max_f(row[c], PROBABILITY_FLOOR));
+            evidence[c] = (uint16_t)(0.5f - EVIDENCE_STEPS * logf(min_f(max_f(row[c], PROBABILITY_FLOOR), 1.0f)));
         }
         a->proper.data[n] = fabs(total - 1.0) < 1e-2 && least >= 0;
     }
@@ -61,7 +63,7 @@ static void weigh_row(const F32 *depth, int64_t v, const Camera *camera, float f
 typedef struct {
     F32 depth; /* (H, W) metres */
     I32 rows;  /* (H, W), -1 = unknown */
-    U8 proper; /* (K,) bool, of log_probability_rows */
+    U8 proper; /* (K,) bool, of evidence_of_rows */
     Camera camera;
     double depth_max; /* metres */
     F32 weights;      /* (H, W) to fill */
@@ -111,7 +113,7 @@ static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffs
     float margin = least_margin(voxel_size);
     bool weighted = a->trust.shape[0] > 0, clears = a->bounds.nearest.shape[0] > 0;
     int64_t cleared = 0;
-    int64_t classes = a->votes.log_p.shape[1];
+    int64_t classes = a->votes.evidence.shape[1];
     VoxelsInView found;
     int64_t count = look_up_voxels(key, offsets, &a->camera, a->limits.voxel_size, &a->depth, truncation,
                                    (float)a->limits.depth_max, &found);
@@ -133,7 +135,7 @@ static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffs
         }
         float weight = a->votes.weights.data[pixel];
         if (weight > 0 && fabsf(found.distance[k]) <= band)
-            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap);
+            add_vote(buffers, at, a->votes.evidence.data + a->votes.rows.data[pixel] * classes, weight, cap);
     }
     return cleared;
 }

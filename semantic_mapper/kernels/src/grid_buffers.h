@@ -17,7 +17,7 @@ typedef struct {
     F32 tsdf;          /* (capacity, 512) signed distance over truncation, -1 to 1 */
     F32 weight;        /* (capacity, 512) */
     F32 color;         /* (capacity, 512, 3) 0 to 255 */
-    F32 evidence;      /* (capacity, 512, L) sum of weighted log probabilities */
+    U16 evidence;      /* (capacity, 512, L) mean of what votes say; see evidence.h */
     F32 votes;         /* (capacity, 512) */
 } GridBuffers;
 

@@ -80,16 +80,16 @@ static void blend_votes(const Corners *corners, const GridBuffers *buffers, cons
         double voxel_votes = buffers->votes.data[corners->at[i]];
         if (!(voxel_votes > 0)) continue;
         voted += corners->fraction[i];
-        votes += corners->fraction[i] * voxel_votes;
         first[count] = corners->at[i] * classes;
-        factor[count++] = corners->fraction[i];
+        factor[count] = corners->fraction[i] * voxel_votes;
+        votes += factor[count++];
     }
     if (voted == 0 || voted < LEAST_OBSERVED * corners->total) return;
     moved->votes.data[to] = (float)(votes / voted);
     for (int64_t c = 0; c < classes; c++) {
         double evidence = 0.0;
         for (int i = 0; i < count; i++) evidence += factor[i] * (double)buffers->evidence.data[first[i] + c];
-        moved->evidence.data[to * classes + c] = (float)(evidence / voted);
+        moved->evidence.data[to * classes + c] = (uint16_t)(evidence / votes + 0.5);
     }
 }
 
@@ -136,13 +136,12 @@ static void add_voxel(const GridBuffers *buffers, int64_t at, const BlockValues 
         }
         buffers->weight.data[at] = (float)min_d(weight, most);
     }
-    double old = buffers->votes.data[at], votes = old + (double)added->votes.data[from];
-    if (!(added->votes.data[from] > 0)) return;
-    double keep = min_d(1.0, cap / votes);
-    buffers->votes.data[at] = (float)(votes * keep);
+    double old = buffers->votes.data[at], new = added->votes.data[from], votes = old + new;
+    if (!(new > 0)) return;
+    buffers->votes.data[at] = (float)min_d(votes, cap);
     for (int64_t c = 0; c < classes; c++) {
-        float *evidence = buffers->evidence.data + at * classes + c;
-        *evidence = (float)(((double)*evidence + (double)added->evidence.data[from * classes + c]) * keep);
+        uint16_t *evidence = buffers->evidence.data + at * classes + c;
+        *evidence = (uint16_t)((old * *evidence + new * added->evidence.data[from * classes + c]) / votes + 0.5);
     }
 }
 

@@ -45,8 +45,8 @@ ALWAYS_INLINE double sample_tsdf(const double *p, const BlockIndex *index, const
     return fraction_sum > 0 ? total / fraction_sum : NOT_OBSERVED;
 }
 
-/* Interpolates color (3,) and evidence (L,) at a point, and finds the least weight around it; returns the interpolated
- * votes. */
+/* Interpolates color (3,) and evidence (L,), which weighs by its votes, at a point, and finds the least weight around
+ * it; returns the interpolated votes. */
 static inline double gather(const double *p, const BlockIndex *index, const GridBuffers *buffers, double *color,
                             double *evidence, float *least_weight) {
     int64_t classes = buffers->evidence.shape[2];
@@ -72,41 +72,39 @@ static inline double gather(const double *p, const BlockIndex *index, const Grid
         if (voxel_votes > 0) {
             vote_sum += fraction;
             votes += fraction * (double)voxel_votes;
-            const float *own = buffers->evidence.data + at * classes;
-            for (int64_t c = 0; c < classes; c++) evidence[c] += fraction * (double)own[c];
+            const uint16_t *own = buffers->evidence.data + at * classes;
+            for (int64_t c = 0; c < classes; c++) evidence[c] += fraction * (double)voxel_votes * (double)own[c];
         }
     }
     if (color_sum > 0)
         for (int c = 0; c < 3; c++) color[c] /= color_sum;
-    if (vote_sum > 0) {
-        for (int64_t c = 0; c < classes; c++) evidence[c] /= vote_sum;
-        votes /= vote_sum;
-    }
-    return votes;
+    if (!(vote_sum > 0)) return 0.0;
+    for (int64_t c = 0; c < classes; c++) evidence[c] /= votes;
+    return votes / vote_sum;
 }
 
-/* What evidence is multiplied with to be that of independent votes: n_eff / n. */
+/* How many independent votes so many are worth: n_eff, at least 1. */
 static inline double vote_worth(double votes, double vote_discount) {
-    return votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes;
+    return votes > 1 ? votes / (1.0 + vote_discount * (votes - 1.0)) : 1.0;
 }
 
 /* Channel and confidence of one voxel's evidence (L,); -1 and 0 without votes. Below `unknown_below` the channel is -1,
- * too, and the confidence that of the likeliest class. One function for evidence as it is stored (float) and one for
- * evidence that was interpolated (double): differences are taken in the precision of the array. */
+ * too, and the confidence that of the likeliest class. One function for evidence as it is stored and one for
+ * evidence that was interpolated. */
 #define DECIDE(name, type)                                                                                          \
     static inline int64_t name(const type *evidence, int64_t classes, double votes, double vote_discount,           \
                                double unknown_below, double *confidence) {                                          \
         *confidence = 0.0;                                                                                          \
         if (votes <= 0) return -1;                                                                                  \
-        double worth = vote_worth(votes, vote_discount), total = 0.0;                                               \
+        double worth = vote_worth(votes, vote_discount) / EVIDENCE_STEPS, total = 0.0;                              \
         int64_t best = 0;                                                                                           \
         for (int64_t c = 1; c < classes; c++)                                                                       \
-            if (evidence[c] > evidence[best]) best = c;                                                             \
-        for (int64_t c = 0; c < classes; c++) total += exp((evidence[c] - evidence[best]) * worth);                 \
+            if (evidence[c] < evidence[best]) best = c;                                                             \
+        for (int64_t c = 0; c < classes; c++) total += exp((evidence[best] - evidence[c]) * worth);                 \
         *confidence = 1.0 / total;                                                                                  \
         return *confidence < unknown_below ? -1 : best;                                                             \
     }
-DECIDE(decide_stored, float)
+DECIDE(decide_stored, uint16_t)
 DECIDE(decide_interpolated, double)
 #undef DECIDE
 

@@ -71,6 +71,6 @@ static inline bool weaken(const GridBuffers *buffers, int64_t at, const uint8_t 
     buffers->weight.data[at] = MEASURED;
     for (int c = 0; c < 3; c++) buffers->color.data[3 * at + c] = rgb[c];
     buffers->votes.data[at] = 0.0f;
-    memset(buffers->evidence.data + at * classes, 0, (size_t)classes * sizeof(float));
+    memset(buffers->evidence.data + at * classes, 0, (size_t)classes * sizeof(uint16_t));
     return true;
 }

@@ -16,7 +16,7 @@ static void vote_block(const VoteArguments *a, int64_t block, const VoxelOffsets
     const GridBuffers *buffers = &a->buffers;
     const int32_t *key = buffers->keys.data + 3 * block;
     float band = (float)a->limits.vote_band, cap = (float)a->limits.max_weight, max_votes = (float)a->max_votes;
-    int64_t classes = a->votes.log_p.shape[1];
+    int64_t classes = a->votes.evidence.shape[1];
     VoxelsInView found;
     int64_t count = look_up_voxels(key, offsets, &a->camera, a->limits.voxel_size, &a->depth, band,
                                    (float)a->limits.depth_max, &found);
@@ -25,7 +25,7 @@ static void vote_block(const VoteArguments *a, int64_t block, const VoxelOffsets
         float weight = a->votes.weights.data[pixel];
         if (weight <= 0 || fabsf(found.distance[k]) > band) continue;
         if (buffers->weight.data[at] > 0 && buffers->votes.data[at] < max_votes)
-            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap);
+            add_vote(buffers, at, a->votes.evidence.data + a->votes.rows.data[pixel] * classes, weight, cap);
     }
 }
 

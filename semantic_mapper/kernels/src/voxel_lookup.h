@@ -11,9 +11,9 @@ typedef struct {
 
 /* What a frame says of classes: Votes of mapping/fusion.py. */
 typedef struct {
-    F32 log_p;   /* (K, L) floored log probabilities */
-    I32 rows;    /* (H, W) which of them a pixel takes, where its weight is > 0 */
-    F32 weights; /* (H, W) 0 to 1 */
+    U16 evidence; /* (K, L) */
+    I32 rows;     /* (H, W) which of them a pixel takes, where its weight is > 0 */
+    F32 weights;  /* (H, W) 0 to 1 */
 } Votes;
 
 /* Camera coordinates of the voxels of a block from its first one, metres. */

@@ -17,7 +17,7 @@ def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     fuse_sphere(voxel_map, 3)
     voxel_map.save(path)
     said = run_ok("info", path).stdout
-    assert all(text in said for text in ("version 3", "3, the last one at", "3 cm", "72", "three: table, cup, wall"))
+    assert all(text in said for text in ("version 4", "3, the last one at", "3 cm", "72", "three: table, cup, wall"))
     found = json.loads(run_ok("info", path, "--json").stdout)
     assert (found["frames"], found["last_stamp_ns"], found["blocks"]) == (3, 1002, voxel_map.block_count)
     keys = voxel_map.block_state()["keys"]
