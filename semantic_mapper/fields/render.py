@@ -78,8 +78,15 @@ def _arrays(render: Rendered) -> tuple[Float32, NDArray[np.bool_], Float32]:
 
 def softmax(logits: Float32) -> Float32:
     """Probabilities along the last axis."""
-    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return raised / raised.sum(axis=-1, keepdims=True)
+    out = np.empty(logits.shape, np.float32)
+    classes = logits.shape[-1]
+    softmax_rows(out.size // classes, np.ascontiguousarray(logits).reshape(-1, classes), out.reshape(-1, classes))
+    return out
+
+
+@parallel_kernel()
+def softmax_rows(count: int, logits: Float32, out: Float32) -> None:
+    """``softmax`` of ``count`` rows (N, L), at most 256 classes."""
 
 
 def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32, NDArray[np.bool_], Float32, int]:

@@ -69,7 +69,7 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
         holds = (moved.weight > 0).any(axis=1)  # votes come with weight
         if holds.any():
             blocks = target.activate(wanted[holds])
-            added = BlockValues(*(part[holds] for part in moved))
+            added = BlockValues._make(part[holds] for part in moved)
             _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
             target.mark_changed(blocks, version)
 
@@ -81,7 +81,7 @@ def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
         part = packed[start : start + MERGED_AT_ONCE]
         values = source.read(part)
         holds = (values.weight > 0).any(axis=1)
-        part, values = part[holds], BlockValues(*(array[holds] for array in values))
+        part, values = part[holds], BlockValues._make(array[holds] for array in values)
         target.mark_changed(target.fill(part, values), version)
 
 

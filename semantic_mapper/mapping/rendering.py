@@ -15,7 +15,7 @@ import numpy as np
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
 from semantic_mapper.fields.base import StreamField
-from semantic_mapper.fields.render import View, render_sparse_view, render_view, softmax
+from semantic_mapper.fields.render import View, render_sparse_view, render_view
 from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels import parallel_kernel
@@ -92,11 +92,17 @@ def add_own_image(view: RenderedView, field: StreamField[Any], current: Any, wei
         return view
     height, width = view.known.shape
     if own.shape[:2] != view.known.shape:
-        own = np.asarray(cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-    own = np.log(np.maximum(softmax(own), PROBABILITY_FLOOR))
-    rendered = np.log(np.maximum(view.probabilities, PROBABILITY_FLOOR))
-    joined = softmax((weight * own + (1 - weight) * rendered).astype(np.float32, copy=False))
-    return view._replace(probabilities=np.where(view.known[..., None], joined, view.probabilities))
+        own = cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR)
+    own = np.ascontiguousarray(own, np.float32)
+    joined = view.probabilities.copy()
+    rows = (own.reshape(-1, own.shape[2]), joined.reshape(-1, own.shape[2]))
+    join_opinions(len(rows[0]), *rows, np.ascontiguousarray(view.known).ravel(), weight, PROBABILITY_FLOOR)
+    return view._replace(probabilities=joined)
+
+
+@parallel_kernel()
+def join_opinions(count: int, own: Float32, probabilities: Float32, known: Bool, weight: float, floor: float) -> None:
+    """Replace ``probabilities`` (N, L) that are ``known`` (N,) by the mean of ``add_own_image`` with ``own`` logits."""
 
 
 class RateController:

@@ -1,5 +1,6 @@
 /* Depth borders drawn to the edges of the image: see imaging.py. */
 #include <math.h>
+#include <stdlib.h>
 
 #include "kernels.h"
 
@@ -19,8 +20,10 @@ typedef struct {
     int64_t left, right, top, bottom;
 } Window;
 
-/* Depth at a pixel whose window holds surfaces at `low` and at `high`. */
-static float choose_surface(const DrawArguments *a, const Window *w, int64_t pixel, float low, float high) {
+/* Depth at a pixel whose window holds surfaces at `low` and at `high`; `alike` is the weight of each difference of a
+ * colour channel. */
+static float choose_surface(const DrawArguments *a, const Window *w, int64_t pixel, float low, float high,
+                            const double *alike) {
     const int64_t width = a->filled.shape[1];
     const float own = a->filled.data[pixel], middle = 0.5f * (low + high);
     const uint8_t *colour = a->rgb.data + 3 * pixel;
@@ -30,12 +33,9 @@ static float choose_surface(const DrawArguments *a, const Window *w, int64_t pix
             const int64_t other = y * width + x;
             const float z = a->measured.data[other];
             if (other == pixel || !(z > 0)) continue;
-            double distance = 0;
-            for (int c = 0; c < 3; c++) {
-                const double difference = (double)a->rgb.data[3 * other + c] - (double)colour[c];
-                distance += difference * difference;
-            }
-            const double weight = exp(-COLOUR_RATE * distance);
+            const uint8_t *its = a->rgb.data + 3 * other;
+            double weight = alike[abs(its[0] - colour[0])];
+            weight *= alike[abs(its[1] - colour[1])] * alike[abs(its[2] - colour[2])];
             const int side = z > middle;
             count[side] += weight, sum[side] += weight * (double)z;
         }
@@ -48,34 +48,48 @@ static bool apart(float one, float other) {
     return (double)fabsf(one - other) > STEP * (double)min_f(one, other) + STEP_M;
 }
 
-/* Whether depth leaps from one pixel to the next somewhere in the window: on a slanted surface it climbs. */
-static bool has_leap(const DrawArguments *a, const Window *w) {
+/* Of the rows of a window, one column: its depth, and whether depth leaps within it, and to the next column. On a
+ * slanted surface it climbs. */
+typedef struct {
+    float low, high;
+    bool leaps, leaps_right;
+} Column;
+
+static void look_down(const DrawArguments *a, const Window *rows, Column *columns) {
     const int64_t width = a->filled.shape[1];
-    for (int64_t y = w->top; y < w->bottom; y++)
-        for (int64_t x = w->left; x < w->right; x++) {
-            const float *z = a->filled.data + y * width + x;
-            if (x + 1 < w->right && apart(z[0], z[1])) return true;
-            if (y + 1 < w->bottom && apart(z[0], z[width])) return true;
+    for (int64_t x = 0; x < width; x++) columns[x] = (Column){INFINITY, 0, false, false};
+    for (int64_t y = rows->top; y < rows->bottom; y++) {
+        const float *z = a->filled.data + y * width;
+        for (int64_t x = 0; x < width; x++) {
+            columns[x].low = min_f(columns[x].low, z[x]), columns[x].high = max_f(columns[x].high, z[x]);
+            columns[x].leaps |= y + 1 < rows->bottom && apart(z[x], z[x + width]);
+            columns[x].leaps_right |= x + 1 < width && apart(z[x], z[x + 1]);
         }
-    return false;
+    }
 }
 
 KERNEL(draw_borders_to_edges, DrawArguments) {
     const int64_t height = a->filled.shape[0], width = a->filled.shape[1];
-    for (int64_t j = start; j < stop; j++)
+    double alike[256];
+    for (int i = 0; i < 256; i++) alike[i] = exp(-COLOUR_RATE * i * i);
+    Column *columns = malloc((size_t)max_i(width, 1) * sizeof *columns);
+    if (!columns) return 1;
+    for (int64_t j = start; j < stop; j++) {
+        Window w = {0, 0, max_i(j - a->reach, 0), min_i(j + a->reach + 1, height)};
+        look_down(a, &w, columns);
         for (int64_t i = 0; i < width; i++) {
+            w.left = max_i(i - a->reach, 0), w.right = min_i(i + a->reach + 1, width);
+            Column all = columns[w.right - 1];
+            for (int64_t x = w.left; x + 1 < w.right; x++) {
+                all.low = min_f(all.low, columns[x].low), all.high = max_f(all.high, columns[x].high);
+                all.leaps |= columns[x].leaps | columns[x].leaps_right;
+            }
             const int64_t pixel = j * width + i;
-            const Window w = {max_i(i - a->reach, 0), min_i(i + a->reach + 1, width), max_i(j - a->reach, 0),
-                              min_i(j + a->reach + 1, height)};
-            const float own = a->filled.data[pixel];
-            float low = own, high = own;
-            for (int64_t y = w.top; y < w.bottom; y++)
-                for (int64_t x = w.left; x < w.right; x++) {
-                    const float z = a->filled.data[y * width + x];
-                    low = min_f(low, z), high = max_f(high, z);
-                }
-            const bool two = apart(low, high) && has_leap(a, &w);
-            a->out.data[pixel] = two ? choose_surface(a, &w, pixel, low, high) : own;
+            const bool two = all.leaps && apart(all.low, all.high);
+            a->out.data[pixel] =
+                two ? choose_surface(a, &w, pixel, all.low, all.high, alike) : a->filled.data[pixel];
         }
+    }
+    free(columns);
     return 0;
 }

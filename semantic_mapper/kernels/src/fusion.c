@@ -16,16 +16,21 @@ typedef struct {
 /* What rows say as evidence, and whether each is of numbers that are not negative and sum to 1. */
 KERNEL(evidence_of_rows, EvidenceArguments) {
     int64_t classes = a->probabilities.shape[1];
+    float all[MOST_CLASSES + LANES] = {0};
+    uint16_t steps[MOST_CLASSES + LANES];
     for (int64_t n = start; n < stop; n++) {
         const float *row = a->probabilities.data + n * classes;
-        uint16_t *evidence = a->evidence.data + n * classes;
         float least = 0.0f;
         double total = 0.0;
-        for (int64_t c = 0; c < classes; c++) {
-            total += row[c];
-            least = min_f(least, row[c]);
-            evidence[c] = (uint16_t)(0.5f - EVIDENCE_STEPS * logf(min_f(max_f(row[c], PROBABILITY_FLOOR), 1.0f)));
+        for (int64_t c = 0; c < classes; c++) total += row[c], least = min_f(least, row[c]);
+        memcpy(all, row, (size_t)classes * sizeof *all);
+        for (int64_t c = 0; c < classes; c += LANES) {
+            Lanes p = larger(splat(PROBABILITY_FLOOR), load(all + c));
+            Lanes logs = EVIDENCE_STEPS * log_of(p > 1.0f ? splat(1) : p);
+            ShortLanes said = __builtin_convertvector(__builtin_convertvector(0.5f - logs, IntLanes), ShortLanes);
+            memcpy(steps + c, &said, sizeof said);
         }
+        memcpy(a->evidence.data + n * classes, steps, (size_t)classes * sizeof *steps);
         a->proper.data[n] = fabs(total - 1.0) < 1e-2 && least >= 0;
     }
     return 0;

@@ -34,6 +34,8 @@ ARRAY(void, AnyArray);
     __attribute__((visibility("default"))) int64_t name(__attribute__((unused)) int64_t start,                        \
                                                         __attribute__((unused)) int64_t stop, const Arguments *a)
 
+#define MOST_CLASSES 256 /* ids are bytes */
+
 /* For functions that are made again for each caller's constants, which a compiler by itself may not do. */
 #define ALWAYS_INLINE static inline __attribute__((always_inline))
 

@@ -81,6 +81,19 @@ INLINE Lanes exp_below(Lanes value) {
     return p * power;
 }
 
+/* log of each lane, for normal numbers above 0, error below 1e-7 of its size or of 1; NaN gives what has no meaning. */
+INLINE Lanes log_of(Lanes x) {
+    IntLanes bits;
+    memcpy(&bits, &x, sizeof bits);
+    IntLanes power = (bits - 0x3f3504f3) >> 23; /* x = m * 2^power, m from sqrt(1/2) to sqrt(2) */
+    IntLanes rest = bits - (power << 23);
+    Lanes m, k = __builtin_convertvector(power, Lanes);
+    memcpy(&m, &rest, sizeof m);
+    Lanes s = (m - 1.0f) / (m + 1.0f), s2 = s * s;
+    Lanes series = 1.0f / 3 + s2 * (1.0f / 5 + s2 * (1.0f / 7 + s2 * (1.0f / 9)));
+    return k * 0.693359375f + (2.0f * s + 2.0f * s * s2 * series - k * 2.12194440e-4f);
+}
+
 /* 1 / (1 + exp(-x)) of each lane. */
 INLINE Lanes logistic(Lanes x) {
     Lanes e = exp_below(x < 0 ? x : -x), large = 1.0f / (1.0f + e);

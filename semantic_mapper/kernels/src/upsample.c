@@ -1,8 +1,8 @@
 /* Joint bilateral upsampling of a coarse rendered view: see mapping/rendering.py. */
 #include <math.h>
-#include <string.h>
 
 #include "kernels.h"
+#include "simd.h"
 
 typedef struct {
     I64 channel;  /* (h, w) likeliest class, -1 = unknown */
@@ -41,26 +41,8 @@ typedef struct {
 /* The coarse pixels round one full pixel. */
 typedef struct {
     int64_t count, index[9], channel[9];
-    float weight[9];
+    float weight[2 * LANES];
 } Taps;
-
-/* exp(x) for x <= 0, relative error below 1e-6; values under e^-87 become 0. */
-static float fast_exp(float x) {
-    if (!(x >= -87.0f)) return x < -87.0f ? 0.0f : x; /* or not a number */
-    const int32_t k = (int32_t)(x * 1.4426950408889634f - 0.5f);
-    const float r = x - (float)k * 0.6931471805599453f;
-    float p = 1.0f / 720;
-    p = p * r + 1.0f / 120;
-    p = p * r + 1.0f / 24;
-    p = p * r + 1.0f / 6;
-    p = p * r + 0.5f;
-    p = p * r + 1.0f;
-    p = p * r + 1.0f;
-    const int32_t bits = (k + 127) << 23; /* 2^k */
-    float power;
-    memcpy(&power, &bits, sizeof power);
-    return p * power;
-}
 
 /* The tap of the largest weight among those of the class that all give the largest total, -1 without taps. */
 static int64_t nearest_of_class(const Taps *taps, const F32 *probabilities) {
@@ -97,6 +79,7 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
         const float z = a->depth.data[at], depth_rate = z > 0 ? DEPTH_RATE / z : 0.0f;
         Taps taps;
         taps.count = 0;
+        store(taps.weight, splat(0)), store(taps.weight + LANES, splat(0));
         for (int64_t j = max_i(j0 - 1, 0); j < min_i(j0 + 2, height); j++)
             for (int64_t i = max_i(i0 - 1, 0); i < min_i(i0 + 2, width); i++) {
                 const int64_t from = j * width + i;
@@ -107,8 +90,10 @@ static void upsample_row(const UpsampleArguments *a, int64_t v) {
                 float cost = (r * r + g * g + b * b) * COLOUR_RATE + dy * dy + dx * dx;
                 if (look[3] > 0) cost += min_f(step * step, LARGEST_STEP);
                 taps.index[taps.count] = from, taps.channel[taps.count] = a->channel.data[from];
-                taps.weight[taps.count++] = fast_exp(-cost) + LEAST_WEIGHT;
+                taps.weight[taps.count++] = -cost;
             }
+        for (int64_t t = 0; t < taps.count; t += LANES)
+            store(taps.weight + t, exp_below(load(taps.weight + t)) + LEAST_WEIGHT);
         a->out.data[at] = (int32_t)nearest_of_class(&taps, &a->probabilities);
     }
 }
