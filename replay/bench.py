@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-# Open3D comes without types.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import dataclasses
 import itertools
 import time
@@ -13,23 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig, VoxelMapConfig
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.geometry import invert_pose, scale_intrinsics
+from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb
 from semantic_mapper.kernels.binding import thread_count
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.types import Float32, PosedFrame
+from semantic_mapper.replay.peers.ours import Open3DFusion, make_setup, some_votes
+from semantic_mapper.types import PosedFrame
 
 WIDTH, HEIGHT = 640, 480  # of the frames that are measured
-COARSE = (120, 160)  # size of the rendered view that is upsampled, as the pipeline has it
 CLASSES = (20, 40)
 WARM_UP = 3  # frames that do not count: first growth of buffers
 
@@ -44,20 +40,19 @@ def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02, repeat
     """
     posed, _ = _frames(log, frames + WARM_UP)
     config = VoxelMapConfig(voxel_size_m=voxel_size_m)
-    votes = {count: _some_probabilities(count) for count in CLASSES}
-    height, width = COARSE  # each pixel takes the coarse one that it lies in
-    rows = np.arange(HEIGHT)[:, None] * height // HEIGHT * width + np.arange(WIDTH) * width // WIDTH
-    rows = rows.astype(np.int32)
+    votes = {count: some_votes(count, (HEIGHT, WIDTH)) for count in CLASSES}
     medians: list[dict[str, float]] = []
     sizes = {"blocks": 0, "open3d_blocks": 0}
     for repeat in range(repeats):
-        reference = _Open3DFusion(config)
+        reference = Open3DFusion(make_setup(posed[0].intrinsics, config))
         maps = {n: VoxelMap(config, make_label_set("bench", [f"class {c}" for c in range(n)])) for n in CLASSES}
         taken: dict[str, list[float]] = {name: [] for name in ("open3d", *map(str, CLASSES))}
         for number, frame in enumerate(posed):
             depth = np.ascontiguousarray(frame.depth_m, np.float32)
-            turns: Mapping[str, Callable[[], object]] = {"open3d": partial(reference.integrate, frame, depth)} | {
-                str(n): partial(voxel_map.integrate, frame, depth, votes[n], rows=rows) for n, voxel_map in maps.items()
+            frame = dataclasses.replace(frame, depth_m=depth)
+            turns: Mapping[str, Callable[[], object]] = {"open3d": partial(reference.add, frame)} | {
+                str(n): partial(voxel_map.integrate, frame, depth, votes[n][0], rows=votes[n][1])
+                for n, voxel_map in maps.items()
             }
             order = list(turns)
             for name in order[(first := (number + repeat) % len(order)) :] + order[:first]:
@@ -139,43 +134,7 @@ def _resized(frame: PosedFrame) -> PosedFrame:
     return dataclasses.replace(frame, rgb=rgb, depth_m=depth_m, label=label, intrinsics=k)
 
 
-class _Open3DFusion:
-    """Open3D's own fusion of TSDF and colour, with its own choice of blocks."""
-
-    def __init__(self, config: VoxelMapConfig) -> None:
-        self._o3d = load_open3d()
-        self._config = config
-        core = self._o3d.core
-        dtypes, shapes, cpu = (core.float32,) * 3, ((1,), (1,), (3,)), core.Device("CPU:0")
-        names, size_m, blocks = ("tsdf", "weight", "color"), config.voxel_size_m, config.initial_blocks
-        self._grid = self._o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, size_m, 8, blocks, cpu)
-
-    @property
-    def block_count(self) -> int:
-        return int(self._grid.hashmap().size())
-
-    def integrate(self, frame: PosedFrame, depth_m: Float32) -> None:
-        core, config, k = self._o3d.core, self._config, frame.intrinsics
-        # Open3D puts pixel centres at halves.
-        K = core.Tensor(np.array([[k.fx, 0, k.cx + 0.5], [0, k.fy, k.cy + 0.5], [0, 0, 1]]))
-        T_camera_world = core.Tensor(invert_pose(frame.T_world_camera))
-        image = self._o3d.t.geometry.Image
-        depth = image(core.Tensor.from_numpy(depth_m))
-        color = image(core.Tensor.from_numpy(frame.rgb.astype(np.float32)))
-        limits = (1.0, config.depth_max_m, config.truncation_voxels)
-        blocks = self._grid.compute_unique_block_coordinates(depth, K, T_camera_world, *limits)
-        self._grid.integrate(blocks, depth, color, K, K, T_camera_world, *limits)
-
-
 def _milliseconds(work: Callable[[], object]) -> float:
     began = time.perf_counter()
     work()
     return (time.perf_counter() - began) * 1e3
-
-
-def _some_probabilities(classes: int) -> Float32:
-    """(h * w, L): patches of 10 x 10 pixels of one class each, as sure as a field is."""
-    rng = np.random.default_rng(0)
-    patch: NDArray[np.int64] = rng.integers(0, classes, (COARSE[0] // 10, COARSE[1] // 10))
-    sure = np.eye(classes, dtype=np.float32)[np.repeat(np.repeat(patch, 10, 0), 10, 1)]
-    return np.ascontiguousarray(0.9 * sure + np.float32(0.1 / classes)).reshape(-1, classes)

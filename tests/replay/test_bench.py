@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from semantic_mapper.config import MapperConfig, with_quality
+from semantic_mapper.config import MapperConfig, VoxelMapConfig, with_quality
 from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
 from semantic_mapper.replay.log import demo_log
+from semantic_mapper.replay.peers.comparison import compare_peers, drift, write_peers
+from semantic_mapper.types import CameraIntrinsics
 from tests.contract.golden import form, undocumented
+from tests.drawn_room import truth_of, walk_frames
 
 
 def test_fusion_is_measured_against_open3d() -> None:
@@ -25,3 +31,28 @@ def test_pipeline_reports_its_rate_its_stages_and_what_the_labels_are_worth() ->
     assert {"encode", "render", "fuse"} <= set(found["stages_ms"])
     assert sum(found["stages_ms"].values()) <= found["p95_ms"] * 1.05
     assert 0.1 < found["miou"] <= 1
+
+
+def test_peers_are_measured_on_the_same_frames_and_one_that_is_absent_names_what_brings_it(tmp_path: Path) -> None:
+    frames = walk_frames(1, 6, CameraIntrinsics(130.0, 130.0, 80.0, 60.0, 160, 120))
+    np.savez(mesh := tmp_path / "mesh.npz", vertices=np.eye(3), faces=np.arange(3)[None])
+    names = ("ours-no-classes", "open3d", "ours-odometry", "vdbfusion")
+    found = compare_peers(frames, VoxelMapConfig(voxel_size_m=0.05), truth=mesh, names=names, repeats=1)
+    ours, open3d, odometry, absent = found["peers"]
+    for row in found["peers"]:
+        assert undocumented("bench", form({**found, "peers": [row]})) == []
+    assert ours["cpu_ms"][0] > 0 and open3d["peak_mb"] > ours["peak_mb"] > ours["loaded_mb"] > 0
+    assert ours["ghosts"] < 0.1 < 0.9 < open3d["ghosts"]  # Open3D does not see through its surfaces
+    assert odometry["lost"] == 0 and odometry["ate_m"] < 0.02
+    assert "vdbfusion" in absent["problem"] and "uv pip install" in absent["install"]
+    write_peers(tmp_path, found)
+    assert (tmp_path / "peers.png").stat().st_size > 1000
+
+
+def test_drift_is_the_error_of_motions_and_of_aligned_positions() -> None:
+    poses = truth_of(walk_frames(1, 5, CameraIntrinsics(13.0, 13.0, 8.0, 6.0, 16, 12)))
+    assert drift(poses, np.linalg.inv(poses[0]) @ poses) == {"lost": 0, "rpe_m": 0.0, "rpe_deg": 0.0, "ate_m": 0.0}
+    off = poses.copy()
+    off[1, :3, 3] += 0.01  # wrong by 17.3 mm in two of three motions
+    off[4] = np.nan
+    assert drift(poses, off)["rpe_m"] == pytest.approx(0.01 * np.sqrt(2), abs=1e-5) and drift(poses, off)["lost"] == 1

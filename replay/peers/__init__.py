@@ -1,0 +1,1 @@
+"""Other mappers and odometries, measured beside ours on one log."""
