@@ -22,7 +22,7 @@ from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.peers.ours import Open3DFusion, make_setup, some_votes
+from semantic_mapper.replay.peers.fusion import Open3DFusion, make_setup, some_votes
 from semantic_mapper.types import PosedFrame
 
 WIDTH, HEIGHT = 640, 480  # of the frames that are measured

@@ -24,14 +24,14 @@ from semantic_mapper.geometry import align_similar, invert_pose, pose_distance
 from semantic_mapper.replay.evaluate.mesh_surface import read_mesh, surface_figures
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.replay.peers.ours import make_setup
+from semantic_mapper.replay.peers.fusion import make_setup
 from semantic_mapper.types import Float64, PosedFrame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WARM_UP = 3  # frames that do not count
-_OURS = "semantic_mapper.replay.peers.ours"
+_HERE = "semantic_mapper.replay.peers"
 _EXTRA = "pip install 'semantic-mapper[peers]'"
 _OWN = "uv venv -p 3.10 vdb && uv pip install -p vdb vdbfusion 'numpy<2', then --python vdbfusion=vdb/bin/python"
 
@@ -41,23 +41,21 @@ class PeerKind(NamedTuple):
 
     kind: str  # mapper or odometry
     title: str
-    runs: str  # MODULE:CLASS; without a module, of the worker
+    runs: str  # MODULE:FUNCTION; without a module, of the worker
     install: str = _EXTRA  # what brings it
 
 
 PEERS = {
-    "ours": PeerKind("mapper", "ours, 20 classes", f"{_OURS}:SemanticFusion"),
-    "ours-no-classes": PeerKind("mapper", "ours, no classes", f"{_OURS}:Fusion"),
-    "open3d": PeerKind("mapper", "Open3D VoxelBlockGrid", f"{_OURS}:Open3DFusion"),
-    "opencv": PeerKind(
-        "mapper", "OpenCV HashTSDF", "OpenCVHashTSDF", "pip install 'opencv-contrib-python-headless>=5'"
-    ),
-    "vdbfusion": PeerKind("mapper", "VDBFusion", "VDBFusion", _OWN),
-    "octomap": PeerKind("mapper", "OctoMap", "OctoMap"),
-    "ours-odometry": PeerKind("odometry", "ours", f"{_OURS}:Odometry"),
-    "small-gicp": PeerKind("odometry", "small_gicp", "SmallGicp"),
-    "kiss-icp": PeerKind("odometry", "KISS-ICP", "KissIcp"),
-    "open3d-odometry": PeerKind("odometry", "Open3D RGB-D", f"{_OURS}:Open3DOdometry"),
+    "ours": PeerKind("mapper", "ours, 20 classes", f"{_HERE}.fusion:ours_with_classes"),
+    "ours-no-classes": PeerKind("mapper", "ours, no classes", f"{_HERE}.fusion:ours"),
+    "open3d": PeerKind("mapper", "Open3D VoxelBlockGrid", f"{_HERE}.fusion:open3d"),
+    "opencv": PeerKind("mapper", "OpenCV HashTSDF", "opencv", "pip install 'opencv-contrib-python-headless>=5'"),
+    "vdbfusion": PeerKind("mapper", "VDBFusion", "vdbfusion", _OWN),
+    "octomap": PeerKind("mapper", "OctoMap", "octomap"),
+    "ours-odometry": PeerKind("odometry", "ours", f"{_HERE}.odometry:ours"),
+    "small-gicp": PeerKind("odometry", "small_gicp", "small_gicp"),
+    "kiss-icp": PeerKind("odometry", "KISS-ICP", "kiss_icp"),
+    "open3d-odometry": PeerKind("odometry", "Open3D RGB-D", f"{_HERE}.odometry:open3d"),
 }
 
 
@@ -112,7 +110,7 @@ def compare_peers(
             if any("problem" in run for run in found[name]):
                 continue
             kind = PEERS[name].kind
-            job = {"peer": PEERS[name].runs, "kind": kind, "scores": repeat == 0, "setup": dataclasses.asdict(setup)}
+            job = {"peer": PEERS[name].runs, "scores": repeat == 0, "setup": dataclasses.asdict(setup)}
             run = _run(Path(folder), job, pythons.get(name, sys.executable))
             found[name].append(run)
             if repeat or "problem" in run:

@@ -34,7 +34,7 @@ def test_pipeline_reports_its_rate_its_stages_and_what_the_labels_are_worth() ->
 
 
 def test_peers_are_measured_on_the_same_frames_and_one_that_is_absent_names_what_brings_it(tmp_path: Path) -> None:
-    frames = walk_frames(1, 6, CameraIntrinsics(130.0, 130.0, 80.0, 60.0, 160, 120))
+    frames = walk_frames(1, 5, CameraIntrinsics(130.0, 130.0, 80.0, 60.0, 160, 120))
     np.savez(mesh := tmp_path / "mesh.npz", vertices=np.eye(3), faces=np.arange(3)[None])
     names = ("ours-no-classes", "open3d", "ours-odometry", "vdbfusion")
     found = compare_peers(frames, VoxelMapConfig(voxel_size_m=0.05), truth=mesh, names=names, repeats=1)
