@@ -1,7 +1,5 @@
 """What cameras give (images that have no pose yet), what pose sources give, and the bases of both."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping

@@ -5,8 +5,6 @@ A file is TOML or JSON: ``fx fy cx cy width height`` in pixels and ``distortion`
 ``T_rig_camera``, where the camera sits, row by row. YAML is that of ROS (camera_info) or Kalibr.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

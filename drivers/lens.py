@@ -3,8 +3,6 @@
 A lens is judged by its values: zeros at the end of the coefficients say nothing, and missing ones are zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Live cameras: devices that may go away and come back, read by a thread of their own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -5,8 +5,6 @@ It offers ``Config``, a ``msgspec.Struct``; ``open_camera(config, camera_id)``, 
 (``CameraError``, ``DependencyError``: it cannot be searched for), which opens nothing for longer than a question.
 """
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence

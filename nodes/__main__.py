@@ -1,7 +1,5 @@
 """The process of a node: ``python -m semantic_mapper.nodes KIND JOB``."""
 
-from __future__ import annotations
-
 import pkgutil
 import sys
 

@@ -1,7 +1,5 @@
 """Examinations of this machine. Each finds something out; none changes anything."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

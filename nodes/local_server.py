@@ -1,7 +1,5 @@
 """Pages that are served to browsers of this machine."""
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Answers about a map, as plain data."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Maps for other tools: fetched again and again, and in plain forms."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The frame round every node: its one argument, heartbeats to the launcher, the stop request, exit codes."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Options of the nodes, as they stand in launch files. Every default is documented where it is declared."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

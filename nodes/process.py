@@ -3,8 +3,6 @@
 Imports nothing heavy: thread counts must be in the environment before torch or Open3D are loaded.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

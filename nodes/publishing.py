@@ -1,7 +1,5 @@
 """Publishing: of what a node says of itself, and at a second endpoint for other programs and machines."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The streams of frames that a node takes in: what they are, which have ended, and which frames never came."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """What a session leaves behind: map.npz, map.ply, summary.json, overview.png, report.html."""
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Callable, Iterator, Mapping

@@ -4,8 +4,6 @@ All else stays as it is, byte for byte: colour images, poses, stamps, other topi
 What was rendered is marked in each frame (``PosedFrame.label_is_pseudo``, ``depth_sigma_m``), and a note says by whom.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator

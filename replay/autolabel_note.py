@@ -1,7 +1,5 @@
 """Who has rendered the pseudo labels of a log: an attachment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -6,8 +6,6 @@ mesh; box if left out), ``T_world_box`` (4x4), ``size`` (3, metres), ``polygon``
 ``merge`` names, for a class of the pseudo labels, the classes that they cannot tell from it.
 """
 
-from __future__ import annotations
-
 import codecs
 import json
 from collections.abc import Callable, Mapping

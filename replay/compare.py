@@ -1,7 +1,5 @@
 """Two runs of one log, compared: what their summaries count and score, and how far their maps are apart."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Score weights against the label images of a log."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a job on a log reports to while it runs, and who may end it early."""
 
-from __future__ import annotations
-
 
 class JobMonitor:
     """This one shows nothing and never stops a job; the command line's draws a bar and listens to signals."""

@@ -4,8 +4,6 @@
 the classes of the log. Pixels of the ignore id are not labelled: strokes are a label image, too.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass, replace

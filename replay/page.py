@@ -4,8 +4,6 @@ Pictures, figures and the map's points are inside the page; it fetches nothing, 
 from files and sockets is text in it: escaped, with control characters as escapes.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Relabel a saved map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from semantic_mapper.fields.nesf import find_nesf

@@ -1,7 +1,5 @@
 """Where the frames of a log are in a saved map."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The same is written to a recording (.rrd) and sent to a viewer that watches, so 
 how.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A map gets metres afterwards: a length that is known scales the poses of its log, which is then mapped again."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Folders and files of results: checked before minutes are spent on them, held by one run, found by their names."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shlex

@@ -1,7 +1,5 @@
 """The summary of a run: read, and as a table for people; several side by side."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

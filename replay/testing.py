@@ -1,7 +1,5 @@
 """Replays inside tests: a log goes through the very pipeline of a robot, and the map is there to be asserted on."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Ask the map of a running mapper, or correct its poses, from any process."""
 
-from __future__ import annotations
-
 import threading
 import uuid
 from pathlib import Path

@@ -3,8 +3,6 @@
 Every struct here is frozen; ``load_config`` fills one from a file, ``to_toml_dict`` gives it back as plain data.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import tomllib

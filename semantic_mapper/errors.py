@@ -1,7 +1,5 @@
 """The one error tree. Every message says what is wrong, where, and how to fix it."""
 
-from __future__ import annotations
-
 
 class SemanticMapperError(Exception):
     """Base of every error this project raises on purpose."""

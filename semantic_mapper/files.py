@@ -5,8 +5,6 @@ place in one step (``rename``): an existing link is replaced, never written thro
 written, so that what a killed process has left can be distinguished from what another one is about to finish.
 """
 
-from __future__ import annotations
-
 import codecs
 import fcntl
 import json

@@ -5,8 +5,6 @@ up writes warnings to stderr and is silent otherwise. A program that calls ``str
 the events as structlog's; nothing here changes that configuration.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the C library does with memory that a process gives back, and what is said where memory does not suffice."""
 
-from __future__ import annotations
-
 import ctypes
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)

@@ -4,8 +4,6 @@
 reports. What it cannot judge it hides.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Rays through pixels, and poses, in torch: differentiable, on any device. Conventions as in ``geometry``."""
 
-from __future__ import annotations
-
 import torch
 
 from semantic_mapper.geometry import expect_shape

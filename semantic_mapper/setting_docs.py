@@ -3,8 +3,6 @@
 The options of the command line and ``docs/settings.md`` are made from it, so that each setting is described once.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import inspect

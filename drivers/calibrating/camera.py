@@ -1,7 +1,5 @@
 """Focal length, principal point and lens distortion of one camera, and how well they are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """From gathered views to calibrated cameras and, of those that see the board at once, to where they sit on a rig."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

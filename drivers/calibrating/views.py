@@ -1,7 +1,5 @@
 """Views of a board: found in images, those kept that say something new, and what they still lack, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """An OAK as a camera: messages of the device become images with colours, metres and stamps on this machine's clock."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

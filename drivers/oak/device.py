@@ -4,8 +4,6 @@ A pipeline has two parts: its sources are the device's, or files and nodes of th
 the same. No Python runs in DepthAI's own threads, where an exception would end the process.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress

@@ -1,7 +1,5 @@
 """DepthAI, which OAK cameras are connected, and why one cannot be had."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import os

@@ -4,8 +4,6 @@ DepthAI's poses carry no time. With one pair under way it is certain which one a
 is too slow, pairs are left out instead of queueing up.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

@@ -1,7 +1,5 @@
 """Video files and streams as cameras: RTSP, HTTP and what else FFmpeg reads by a URL."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import replace

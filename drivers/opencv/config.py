@@ -1,7 +1,5 @@
 """Settings of a video file or stream."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from semantic_mapper import config

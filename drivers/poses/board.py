@@ -1,7 +1,5 @@
 """The camera's pose from a printed board that it sees: ChArUco, or a grid of AprilTags; and the board to be printed."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

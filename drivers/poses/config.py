@@ -1,7 +1,5 @@
 """Settings of the pose sources. Every default is documented where it is declared."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal

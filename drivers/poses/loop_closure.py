@@ -8,8 +8,6 @@ the same. One candidate is looked at for each image, so no image waits long, and
 The graph is optimised with GTSAM (Levenberg-Marquardt, Huber).
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter, deque
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Poses by time: interpolated between samples, extrapolated for a bounded while."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass

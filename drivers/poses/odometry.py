@@ -10,8 +10,6 @@ keyframe again. A camera that stays lost begins a new world, in which no loops a
 Same images, same poses and corrections, bit for bit.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """A camera and a source of poses as one source of frames; poses that cannot be true are refused and counted."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """From settings to a pose source; those of devices and of cameras that never move are here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Poses from outside: a robot's own odometry on a ZeroMQ topic, brought to the moment of each image."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

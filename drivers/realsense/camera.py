@@ -1,7 +1,5 @@
 """A RealSense as a camera: sensors opened, frames synced, aligned, and made images on this machine's clock."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The RealSense SDK, which cameras are connected, and why one cannot be had."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 from typing import Any

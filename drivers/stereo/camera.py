@@ -1,7 +1,5 @@
 """A stereo pair as a ``Camera``: the device's images cut in halves, rectified, and matched."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a stereo pair."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

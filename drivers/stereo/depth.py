@@ -4,8 +4,6 @@ A match has to be found from the right image as well, and patches of a few pixel
 left out: no depth is better than a guess, since a map has other views of the place.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """V4L2 cameras: size, rate, pixel format and controls are set, and what the device gives instead is read back."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a V4L2 camera."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

@@ -1,7 +1,5 @@
 """Which V4L2 cameras are connected, under names that stay the same when one is plugged in again."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

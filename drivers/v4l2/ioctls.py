@@ -4,8 +4,6 @@ Layouts and numbers are those of linux/videodev2.h, the same on all 64 bit machi
 where a device cannot be opened, does not answer or refuses.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import fcntl

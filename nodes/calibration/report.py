@@ -1,7 +1,5 @@
 """What a calibration reports to people and programs, and the files it writes."""
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Views of the board from all sources, as the command line names them: recorded ones in turn, live ones at once."""
 
-from __future__ import annotations
-
 import re
 import threading
 import time

@@ -1,7 +1,5 @@
 """Closed loops of the pose source, on their way to the mapper: a thread asks it to move its map, frames go on."""
 
-from __future__ import annotations
-
 import threading
 from typing import Self
 

@@ -1,7 +1,5 @@
 """What a node that publishes frames waits for: listeners before the first one, delivery after the last."""
 
-from __future__ import annotations
-
 import time
 
 from semantic_mapper.nodes.node import NodeContext

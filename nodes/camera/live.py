@@ -3,8 +3,6 @@
 Frames of a live camera are dropped rather than held back; those of a video file wait for their readers.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The camera node: publishes posed frames, of a log that it plays or of a camera."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 import time

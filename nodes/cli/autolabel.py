@@ -1,7 +1,5 @@
 """``semantic-mapper autolabel``: weights label every frame of a log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``semantic-mapper calibrate``: lenses, and where the cameras of a rig sit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

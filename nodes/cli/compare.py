@@ -1,7 +1,5 @@
 """``semantic-mapper compare``: do two runs of one log come to the same?"""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from semantic_mapper.config import AtLeastZero

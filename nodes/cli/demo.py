@@ -1,7 +1,5 @@
 """``semantic-mapper demo``: the recorded room that comes with the package, as a map or as a robot that runs."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """``semantic-mapper doctor``: what is missing on this machine and how to fix it, and which cameras it has."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 from rich.text import Text

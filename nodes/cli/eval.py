@@ -1,7 +1,5 @@
 """``semantic-mapper eval``: figures of replays side by side, or of a log by several methods."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """The verbs ``export`` (of maps and logs) and ``merge``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``semantic-mapper finetune``: fit the field to a few labelled keyframes of a log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 

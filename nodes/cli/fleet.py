@@ -1,7 +1,5 @@
 """``semantic-mapper fleet``: many logs, many machines, one store of results."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

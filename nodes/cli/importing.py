@@ -1,7 +1,5 @@
 """``semantic-mapper import``: recordings of other programs, films, and damaged logs become logs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``semantic-mapper info``: what a log, a saved map or a file of weights holds, and which weights a mapper uses."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """``semantic-mapper keys``: who may connect from other machines."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """``semantic-mapper label``: label frames by hand, suggest which, or send labelled ones to a running finetuner."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Which frames to label, with which classes, and which labelled ones to send to a finetuner."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

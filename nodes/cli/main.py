@@ -1,7 +1,5 @@
 """The command ``semantic-mapper``. Each verb lives in a file of its own, which is loaded when the verb is named."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,7 +1,5 @@
 """``semantic-mapper map``: a recording becomes a map, in this process."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``semantic-mapper query``: ask a saved map, or that of a running mapper."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext

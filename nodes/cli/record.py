@@ -1,7 +1,5 @@
 """``semantic-mapper record``: what a running launch publishes becomes a log."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

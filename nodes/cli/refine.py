@@ -1,7 +1,5 @@
 """``semantic-mapper refine``: a network that has seen many maps corrects the classes of a saved one."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """``semantic-mapper scale``: a map without metres gets them."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """``semantic-mapper up``: the nodes of a launch file as processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labelled keyframes in, better weights out: the finetuner next to a mapper, between two messages."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import CancelledError

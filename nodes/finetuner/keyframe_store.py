@@ -4,8 +4,6 @@ Each keyframe is a file: the message that it came as, named by the SHA-256 of it
 with their state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The process of a finetuner: its priority and its threads. ``finetuner.py`` has what it does."""
 
-from __future__ import annotations
-
 import os
 
 from semantic_mapper.nodes.node import NodeContext

@@ -4,8 +4,6 @@ A cluster of its own listens on loopback only, and every client needs a token th
 that is reached through a network must need a token, too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import logging

@@ -1,7 +1,5 @@
 """Saved maps of one building fused into one map, which keeps in memory what was used last and the rest on disk."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

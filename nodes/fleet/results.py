@@ -1,7 +1,5 @@
 """Results of a store: as tables for SQL, and compared with those of another store, a gate for releases."""
 
-from __future__ import annotations
-
 import math
 import re
 import tempfile

@@ -4,8 +4,6 @@ So a run that was stopped or killed goes on with the same command, and nothing h
 of the jobs of ``replay``, with its settings and its findings.
 """
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import os

@@ -10,8 +10,6 @@ the document that names them is written last, in one step, so that readers never
     sources/ID                 digest of a log, by its URL, size and version
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import os

@@ -4,8 +4,6 @@ The page is on loopback alone, and its policy lets it speak to nobody but this s
 open cannot reach it: they lack the token, and names that somebody has bound to this machine's address are refused.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

@@ -1,7 +1,5 @@
 """Launch files: which nodes run, with which options, and who listens to whom."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import os

@@ -6,8 +6,6 @@ matter. A pipe, and not the status topic: status comes from the main loop, which
 node is to be found within a second. SIGALRM ends a node whose threads cannot run any more.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

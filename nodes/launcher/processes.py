@@ -1,7 +1,5 @@
 """The processes of a launch: one table of their kinds, one process, and one node over all its restarts."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

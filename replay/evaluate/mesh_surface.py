@@ -1,7 +1,5 @@
 """Compare a replay's map with a reference mesh: how far the surface is off, how much of it is there, and its labels."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Score several ways of labelling the frames of a log side by side, on the frames none of them was fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial

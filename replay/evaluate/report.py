@@ -1,7 +1,5 @@
 """Scores of a log as a table, and with those of replays as a page of HTML."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

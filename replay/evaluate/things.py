@@ -1,7 +1,5 @@
 """Things of a map and of other methods against frames whose objects are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Ground truth in the classes of the map: per frame by class name, and per surface point by majority of the frames."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What exporters share: the frame that they get, formats of numbers, the way of a camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar

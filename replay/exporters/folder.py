@@ -1,7 +1,5 @@
 """Logs as folders of images: the sequence folder that ``import`` reads, TUM RGB-D, and TUM's trajectory file alone."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from pathlib import Path

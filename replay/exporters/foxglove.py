@@ -6,8 +6,6 @@ Of each camera: ``/CAMERA/rgb`` (foxglove.CompressedImage, the log's own PNG or 
 "world"). The schemas are described at https://docs.foxglove.dev/docs/sdk/schemas.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A saved map for other programs: one file format each, chosen by the name of the file or by hand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args

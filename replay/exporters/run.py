@@ -1,7 +1,5 @@
 """A log -> the format of another program: choose the writer, give it the frames, say what it could not hold."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What all importers share: options and report, the shape of a recording, and reading of its images."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 import zlib

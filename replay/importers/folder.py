@@ -4,8 +4,6 @@
 with its one-sigma spread in ``depth_sigma/NNNNNN.png``: they come back with that mark, for frames without the other.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

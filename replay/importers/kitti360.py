@@ -10,8 +10,6 @@ Class ids, names and colours are those of ``kitti360scripts/helpers/labels.py`` 
 https://github.com/autonomousvision/kitti360Scripts, but for its category "void", which is read as unknown.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 

@@ -9,8 +9,6 @@ OpenCV's. With a ``reference_lla`` that is not zero OpenSfM has aligned the mode
 and lengths are metres.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any

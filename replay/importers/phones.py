@@ -10,8 +10,6 @@ add ``perFrameIntrinsicCoeffs`` (fx fy cx cy of each picture, as the lens focuse
 without depth.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The reader that all formats of files fill in: posed pictures, with depth, labels, lenses and times."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ own ``info_semantic.json``, which is looked for in the sequence's folder, the sc
 Replica rooms as rendered for NICE-SLAM: ``traj.txt`` has OpenCV's axes, and one ``cam_params.json`` is for all rooms.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable
 from pathlib import Path

@@ -5,8 +5,6 @@ REP 118: 16UC1 is millimetres with 0 for no measurement, 32FC1 is metres with Na
 PNG; of 32FC1 it holds the inverse depth, quantised.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import tempfile

@@ -8,8 +8,6 @@ Depth that is not registered to colour is registered here, by the two cameras' i
 removed where the camera's calibration tells of it and its images are not rectified already.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Any foreign recording -> log: choose the importer, write what is good, report what is not."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path

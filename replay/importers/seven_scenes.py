@@ -6,8 +6,6 @@ estimated: edges of depth were brought onto edges of colour in one of its sequen
 poses become those of the colour camera.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What recordings hold next to their images: numbered files, rows of numbers, lists, and JSON of other programs."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

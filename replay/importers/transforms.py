@@ -12,8 +12,6 @@ The depth of instant-ngp, ``depth_path``, is in the unit of the poses, times ``i
 them.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -14,8 +14,6 @@ ICL-NUIM (https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html) numbers its fram
 camera and world, whose axes are left-handed. Both are mirrored here, so that z is up in the world.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

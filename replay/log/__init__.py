@@ -1,7 +1,5 @@
 """The log: write, read, recover, play."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import semantic_mapper

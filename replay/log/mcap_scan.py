@@ -4,8 +4,6 @@ An index whose checksum is right names every chunk, whatever is damaged before i
 first record whose head is damaged. Each chunk's own checksum tells whether its messages can be believed.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import struct

@@ -1,7 +1,5 @@
 """What is missing between the frames of a log, camera by camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Plays a log onto a socket: in step with the mapper, in the rhythm of its recording, or as fast as it is taken."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

@@ -1,7 +1,5 @@
 """A recording: one log or several parts, written so that a full disk costs what does not fit and nothing else."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 import time

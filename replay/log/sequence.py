@@ -1,7 +1,5 @@
 """Files of a recording in parts, each a log by itself: ``kitchen.mcap``, ``kitchen-1.mcap``, ``kitchen-2.mcap``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Poses of the frames between those that structure from motion has registered: its points, followed into them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

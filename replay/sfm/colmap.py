@@ -4,8 +4,6 @@ A crash of its native code, or Ctrl-C, ends that process alone (``colmap_process
 COLMAP's pixels begin at the corner of the image, so 0.5 is taken off.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -5,8 +5,6 @@ the folder, and writes a folder ``attempt-K/M`` for each model M of each attempt
 stdout is progress: "what done total". ``... MODEL FILE`` writes a COLMAP model as arrays.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tempfile

@@ -1,8 +1,6 @@
 """The frames of a film, or the pictures of a folder, in their order, with times; which of them are worth a look: sharp
 ones, a step of motion apart; their features; and what a log keeps of its film."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Positions that pictures carry (EXIF), and how they place a model of structure from motion: size, up and north."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

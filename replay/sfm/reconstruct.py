@@ -1,7 +1,5 @@
 """A film becomes a log: frames chosen, poses found, scale and up found, and what lies between filled in."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator

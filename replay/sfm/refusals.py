@@ -1,7 +1,5 @@
 """Why a film gives no poses, and what to do about it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

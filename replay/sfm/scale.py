@@ -1,7 +1,5 @@
 """Which way is up in a model, and how large it is: what structure from motion cannot tell by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar

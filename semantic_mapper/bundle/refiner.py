@@ -1,7 +1,5 @@
 """Poses that fit the pictures: given poses as a prior, corners followed over keyframes, a sliding bundle."""
 
-from __future__ import annotations
-
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

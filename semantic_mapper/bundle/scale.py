@@ -1,7 +1,5 @@
 """How long a unit of a map without scale is: from coarse poses in metres over a long way, or by the floor."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

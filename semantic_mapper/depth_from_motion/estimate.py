@@ -4,8 +4,6 @@ Spreads, in planes of the sweep, are the exponential of a sum of terms, whose fa
 errors are within one spread: rooms of training seeds, every second with poses that are off by 0.06 degrees and 1.5 mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Depth for a stream of posed frames, as they come or a few frames late; and which frames each is matched with."""
 
-from __future__ import annotations
-
 import itertools
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Plane sweep over source views, and semi-global matching: the cost of each pixel at each plane, and its best plane."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 

@@ -1,7 +1,5 @@
 """From a frame to what is matched, small images and their census; and from the depth of these to that of the frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Which way is up in a map, and how its walls run: so that pictures of it stand straight, whatever the world frame."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 Arrays are numpy's. ``StreamingSRay`` computes in them; ``DeviceField`` puts fields of torch behind this seam.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, Self, TypeVar

@@ -1,7 +1,5 @@
 """Fields with weights: a torch module and where it comes from, read from and written to weights files."""
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from dataclasses import dataclass, field

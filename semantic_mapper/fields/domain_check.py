@@ -4,8 +4,6 @@ Measured is the Mahalanobis distance of a picture's features from those of train
 frozen ImageNet backbone, averaged over the picture. Photographs of rooms lie at 1.3 to 1.6, landscapes, streets and
 animals at 2 to 6 (``docs/model-card.md``). The encoder computes these features anyway."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any
 

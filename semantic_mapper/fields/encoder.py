@@ -5,8 +5,6 @@ point in view, and the angle of the surface to gravity, which is found in each i
 EfficientNet-Lite0 (Tan and Le, ICML 2019), a network that has seen photographs before it sees rooms.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Generator, Iterator

@@ -3,8 +3,6 @@
 Each view is encoded by itself, so a network is built once for a size of image, from the tensors of a weights file.
 """
 
-from __future__ import annotations
-
 # OpenVINO leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Mapping

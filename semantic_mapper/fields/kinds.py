@@ -1,7 +1,5 @@
 """The kinds of fields there are, without torch: what each is made from."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple

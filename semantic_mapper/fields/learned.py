@@ -1,7 +1,5 @@
 """Fields that have weights, whatever their kind: what training and checkpoints ask of them, and the kinds there are."""
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 from abc import ABC, abstractmethod

@@ -5,8 +5,6 @@ rays that say the same of the same surface there is nothing to find; at borders 
 where the field is uncertain, there is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

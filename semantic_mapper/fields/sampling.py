@@ -1,7 +1,5 @@
 """Where rays are sampled in streaming: round the depth prior of each, as ascending z depths (R, N) in metres."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 

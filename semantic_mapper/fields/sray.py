@@ -18,8 +18,6 @@ In both orders attention adds to the features (M + f(M) in Eq. 9 and 10, which t
 much they see of a sample.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math

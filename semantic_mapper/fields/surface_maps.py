@@ -3,8 +3,6 @@
 Inverse depth, height above the lowest point in view, and the angle of the surface to gravity, which is found in each
 image by itself."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ there, or to ask ``predict_image`` (the same logits without rays). In training t
 (``source_logits``) teaches the network in every step.
 """
 
-from __future__ import annotations
-
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import torch
 from torch import nn

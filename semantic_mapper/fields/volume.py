@@ -3,8 +3,6 @@
 Sample positions are ascending z depths (R, N) in metres.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false
 import torch

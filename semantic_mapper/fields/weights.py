@@ -8,8 +8,6 @@ A finetuned file carries its *anchors*: the labelled keyframes it was finetuned 
 with depth, labels and pose. They are source views of every later render in the same scene.
 """
 
-from __future__ import annotations
-
 # safetensors leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json

@@ -3,8 +3,6 @@
 Loops of parallel kernels are split over as many threads as torch uses, or would use: kernels do not load it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import inspect

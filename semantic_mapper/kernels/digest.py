@@ -1,7 +1,5 @@
 """Which sources a compiled library belongs to; without imports of ours, since the build reads it."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -5,8 +5,6 @@ depth, and so does what a distance is compared with. Distances that are large ag
 (Geman-McClure), at coarse levels later than at fine ones. Same views, same pose, bit for bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Two kinds: ORB corners for images in a row (3 ms at 320x240), and SIFT features 
 elsewhere, in other light (30 ms). Both are rotation invariant. Everything is deterministic.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

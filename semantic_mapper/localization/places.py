@@ -1,8 +1,6 @@
 """Places seen so far: which of them an image shows, and what a map keeps of its own. Matches are counted with each
 place in turn (1 ms each), which is exact and needs no vocabulary."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ A pose is given only where features *and* depth agree with the map, and no other
 may still be wrong: several have to say the same of where the map is (``find_consensus``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol

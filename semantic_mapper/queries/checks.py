@@ -3,8 +3,6 @@
 Each check raises ``MapError``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

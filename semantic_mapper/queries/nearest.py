@@ -1,7 +1,5 @@
 """What is at a point, and the nearest surface of a class, by searches that need no index of their own."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 

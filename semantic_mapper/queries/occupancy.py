@@ -1,7 +1,5 @@
 """What is free, occupied, unknown or has something that moves: points, and the voxels of a box with their distances."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

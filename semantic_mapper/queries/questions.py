@@ -8,8 +8,6 @@ Header of a question: its fields. Of an answer: ``map`` (``MapState``) and ``ans
 come an error, ``["error", header]``. Sizes are checked before anything is allocated; what is wrong is a
 ``CodecError``."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, get_args

@@ -4,8 +4,6 @@ Every cell of the plan climbs to the place near by that is farthest from the wal
 basin. Two basins are one room where the passage between them is wider than a door, or hardly narrower than the smaller
 of the two."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import cv2

@@ -4,8 +4,6 @@ A zero crossing of the TSDF on the edge between two observed voxels belongs to t
 lower). The mean of a voxel's crossings is its surface point, which has the class, confidence and colour of the
 voxel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 from weakref import WeakKeyDictionary

@@ -1,7 +1,5 @@
 """What S-Ray has to beat with the same labelled keyframes: a per-image U-Net, and labels carried over by depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Settings of every fit: finetuning, fields of one scene, and rounds of learning next to a mapper."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

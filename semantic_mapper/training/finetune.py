@@ -4,8 +4,6 @@ Steps draw rays of a query view rendered from other views, or single images. All
 are the same whatever the device. Kinds of fields that hold one scene are fitted in ways of their own (``FITTERS``).
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence

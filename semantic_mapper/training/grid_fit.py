@@ -4,8 +4,6 @@ A field of one scene is fitted in stages: geometry and colours for every kind (`
 some (``fit_trunk``), then what is its own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

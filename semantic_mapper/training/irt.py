@@ -4,8 +4,6 @@ Steps draw pixels of all labelled frames at once. The texture of a pixel depends
 step looks at patches, not at whole images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

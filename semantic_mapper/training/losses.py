@@ -1,7 +1,5 @@
 """What a rendered ray, and an image by itself, is compared with."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ encoder is frozen, so that whatever a mapper has encoded of its own keyframes st
 the place of old ones at once.
 """
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Callable, Collection, Iterable, Sequence

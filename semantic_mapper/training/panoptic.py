@@ -3,8 +3,6 @@
 Pixels that show boxes that move are left out of the scene, and fill these boxes' own grids in the end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Without depth, points that several posed images show say how far they see: SIFT 
 look at one place from two, and triangulated with the poses as they are.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -4,8 +4,6 @@ What a frame shows are the 10 cm cells that its pixels fall in. A cell is worth 
 in it; what a chosen frame shows is taken from the worth of the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 

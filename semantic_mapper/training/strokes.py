@@ -6,8 +6,6 @@ Min et al., *Fast Global Image Smoothing Based on Weighted Least Squares*, 2014;
 class does; what no stroke reaches stays unlabelled.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

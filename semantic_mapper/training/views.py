@@ -1,7 +1,5 @@
 """Frames as fits take them: labelled views and who sees whom of them, or the rays of all pixels of many frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ allocated by it. Decoded arrays are fresh and writable. In a log a message is a 
 msgpack reader opens. Questions about a map have a codec of their own, ``queries.questions``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

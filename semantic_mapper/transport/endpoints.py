@@ -3,8 +3,6 @@
 Beyond this machine nothing is bound, and nothing connected to, without keys.
 """
 
-from __future__ import annotations
-
 import fcntl
 import ipaddress
 import os

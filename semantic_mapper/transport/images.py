@@ -5,8 +5,6 @@ is decoded; of colour images they, and whether the file is complete, are read fr
 damaged, or not of the (height, width) that is expected, is a ``CodecError``.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 from dataclasses import dataclass

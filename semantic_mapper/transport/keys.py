@@ -5,8 +5,6 @@ A folder of keys holds ``own.key`` and ``own.key_secret`` of this machine (certi
 With keys all messages are encrypted, and both sides have proven who they are before the first one.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

@@ -10,8 +10,6 @@ machine). Position, in metres, and quaternion are of frame ``child`` in frame ``
 ``sigma`` is the position's one-sigma uncertainty in metres; 0 or left out: not known.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

@@ -3,8 +3,6 @@
 A lock in the folder says so, not the process number in its name: containers that share /tmp count theirs by themselves.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -1,8 +1,6 @@
 """Sockets of topics: ``Publisher``, and the two ways to subscribe, ``NewestSubscriber`` and ``LosslessSubscriber``; and
 the two ends of question and answer: ``QueryServer`` (ROUTER) and ``QuerySocket`` (REQ, made again when lost)."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

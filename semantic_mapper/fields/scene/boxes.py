@@ -3,8 +3,6 @@
 Boxes that move each have a small scene grid in their own axes, composited with the scene that stands still.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math

@@ -5,8 +5,6 @@ weight become tokens; they attend to each other and to the texture of the ray's 
 Composited like colours, next to that texture, they give the classes.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from dataclasses import dataclass

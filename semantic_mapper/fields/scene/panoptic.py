@@ -4,8 +4,6 @@ Two semantic fields stand on one scene grid. The fixed one says what the boxes a
 move the density. The learned one is a head on the grid's features, and decides where boxes overlap or end.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 All shapes become closed triangle meshes; ``boxes`` gives the intervals of rays inside each, in torch.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
