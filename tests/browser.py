@@ -4,8 +4,6 @@ The packages are unpacked into ``.tools/chromium`` (100 MB to fetch, 300 MB unpa
 rendered by the CPU (SwiftShader). The browser reaches this machine alone: every other name resolves to nothing.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -5,8 +5,6 @@ A fixture that tests share counts for the test that first asks for it. CPU time 
 quite: tests that share caches and cores took up to ``MARGIN`` times as long as on an idle machine.
 """
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Generator
 

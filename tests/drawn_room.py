@@ -1,7 +1,5 @@
 """A furnished room that a camera walks through, drawn in a moment: colour, depth and true poses."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Figures before they become pictures, for tests of what is drawn where."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any

@@ -1,7 +1,5 @@
 """Small real things shared by tests: a tiny S-Ray and frames of a procedural room."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch

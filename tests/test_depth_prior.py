@@ -1,7 +1,5 @@
 """Depth priors: holes are filled, and borders of depth lie where the image has its edges."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from semantic_mapper.imaging import depth_prior, fill_holes

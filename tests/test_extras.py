@@ -1,7 +1,5 @@
 """Without the extras, maps are made all the same, and what needs an extra names it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

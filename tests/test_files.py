@@ -1,7 +1,5 @@
 """Files that people name are read with a limit, and never waited for."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

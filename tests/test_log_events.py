@@ -1,7 +1,5 @@
 """As a library we leave stdout to the program, and its set-up of structlog as it is."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Secrets of addresses do not come out; everything else stays as it is."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

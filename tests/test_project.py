@@ -1,7 +1,5 @@
 """The project as a whole: its version, its layers, its house rules."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import pkgutil
 import re

@@ -1,7 +1,5 @@
 """The names that ``semantic_mapper`` offers, and that nothing of ours fights a user's own modules."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys

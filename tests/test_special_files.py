@@ -1,7 +1,5 @@
 """Pipes and devices in place of logs, maps and weights are refused at once: they may never begin, or never end."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plain words: terms of the field in names, messages and pages, not a dialect of our own."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

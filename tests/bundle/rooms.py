@@ -1,7 +1,5 @@
 """A walk through a furnished room, for tests of poses from pictures."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

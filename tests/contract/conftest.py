@@ -1,7 +1,5 @@
 """One replay of the golden log for all tests that look at what it leaves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The command in this process and in one of its own, and a saved map that answers at a socket."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Where golden data lies, and how values are written down and compared."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import hashlib

@@ -9,8 +9,6 @@ The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DAT
 are kept.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

@@ -1,7 +1,5 @@
 """Runs of the command over the golden log, and what is measured on what they leave."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Messages of every kind, small, as values: what ``record`` encodes. Tests read the golden bytes alone."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any
 

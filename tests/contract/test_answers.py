@@ -1,7 +1,5 @@
 """Answers to all questions about the golden map, over a real socket."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

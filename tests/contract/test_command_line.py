@@ -1,7 +1,5 @@
 """The command line: every verb, option and default of then, and exit codes. Help texts are free."""
 
-from __future__ import annotations
-
 import enum
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Exported files: what readers of these formats find in them, read without our own code."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Files that earlier versions wrote are read: maps, results, weights, calibrations, keys, corrections, keyframes."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

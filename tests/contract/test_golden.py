@@ -1,7 +1,5 @@
 """Golden data is all there, and small."""
 
-from __future__ import annotations
-
 from tests.contract.golden import FOLDER, LOG, MAP, MAP_COARSE, POINTS, STORED, WEIGHTS
 from tests.contract.record import GROUPS
 

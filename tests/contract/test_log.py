@@ -1,7 +1,5 @@
 """A log of then: it is read, described, replayed, and mended where it was cut off."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

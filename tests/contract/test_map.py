@@ -7,8 +7,6 @@ torch's unvectorised code. Each tolerance is above all of these, and below what 
 votes 2 % heavier, truncation 5 % longer, surface or cameras half a voxel off, one frame left out.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Names that the README, the how-tos and the examples import, and how they are called."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

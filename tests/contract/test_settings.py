@@ -1,7 +1,5 @@
 """The TOML files that ship are read; names and defaults of all settings stand in docs/settings.md."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

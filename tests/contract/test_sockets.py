@@ -1,7 +1,5 @@
 """A running mapper as any program sees it: plain ZeroMQ sockets, golden questions in, and messages that decode."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import tempfile

@@ -4,8 +4,6 @@ Tolerances are those of rounding on other processors; see ``test_map``. Twenty s
 than a render does.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -3,8 +3,6 @@
 Bytes may change with a version of the protocol, or of the libraries in uv.lock that pack PNG and zstd.
 """
 
-from __future__ import annotations
-
 from base64 import b64decode
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A camera before a slanted, textured plane: pictures with exact depth."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Each kernel against the same in plain numpy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth of streams: exact on a textured plane, none where the camera only turns, no frame lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Films, calibrations and patience for tests of cameras."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path

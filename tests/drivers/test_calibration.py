@@ -1,7 +1,5 @@
 """Calibration files of ours, ROS, Kalibr and OpenCV; lenses by their names; images without lens distortion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Video files and streams: real files, a real server, FFmpeg as OpenCV has it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Kinds of cameras by name; one that cannot be loaded hurts no other."""
 
-from __future__ import annotations
-
 import sys
 from types import ModuleType
 

@@ -1,7 +1,5 @@
 """V4L2 cameras that do what they are requested, and all the ways in which they do not."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A box room of points with a floor, a ceiling, four walls and a table, for the tests of pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

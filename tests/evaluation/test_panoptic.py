@@ -1,7 +1,5 @@
 """Panoptic quality against figures reckoned by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

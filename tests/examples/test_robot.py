@@ -1,7 +1,5 @@
 """The sample robot, and the robot of the how-to: they go by the map of a launch that runs."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

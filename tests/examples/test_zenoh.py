@@ -1,7 +1,5 @@
 """The example that publishes a map to Zenoh: what a Zenoh client receives of it."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import threading

@@ -1,7 +1,5 @@
 """A textured wall at z = 2 m seen from cameras on a line: the smallest scene in which reprojection can go wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

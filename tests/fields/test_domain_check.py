@@ -1,7 +1,5 @@
 """Pictures unlike the rooms that weights learned are noticed; of weights that learned otherwise nothing is said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The image encoder, its backbone, and the surface maps that it sees of measured depth."""
 
-from __future__ import annotations
-
 import math
 import os
 import platform

@@ -1,7 +1,5 @@
 """Samples of boxes that move among those of the scene: what is in front dims what is behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A grid as a field: what it claims, its files, and its two ways to render."""
 
-from __future__ import annotations
-
 import torch
 
 from semantic_mapper.config import GridConfig, GridFieldConfig

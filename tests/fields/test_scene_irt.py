@@ -1,7 +1,5 @@
 """The Implicit Ray-Transformer: its points, its tokens, and what it knows without its image."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """The compiled loops of the scene grid against plain torch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

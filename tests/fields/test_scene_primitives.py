@@ -1,7 +1,5 @@
 """Intervals of rays inside of primitives, against points tested one by one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

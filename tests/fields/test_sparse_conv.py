@@ -1,7 +1,5 @@
 """Sparse convolutions against torch's dense ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch.nn.functional import conv3d, conv_transpose3d

@@ -1,7 +1,5 @@
 """S-Ray's equations on a wall that many cameras see, in the paper's order and with one token a view at the surface."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

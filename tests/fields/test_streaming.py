@@ -1,7 +1,5 @@
 """The compiled renderer against `SRay`, the readable reference, at the same weights and samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any

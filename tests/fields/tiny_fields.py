@@ -1,7 +1,5 @@
 """Tiny fields of every kind, and what tests of several kinds share."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

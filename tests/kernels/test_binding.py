@@ -1,7 +1,5 @@
 """Arguments on their way to C, and what is said of those that do not fit."""
 
-from __future__ import annotations
-
 import platform
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The compiled library and the sources and declarations that belong to it."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 import re

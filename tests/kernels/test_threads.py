@@ -1,7 +1,5 @@
 """Kernels on several threads: each iteration runs once, from any caller, and torch's threads leave them the cores."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What several sightings say together, and where that puts the map."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from semantic_mapper.geometry import make_pose, rotation_vector

@@ -1,7 +1,5 @@
 """One tiny log, weights file, config and in-process replay for all tests of the nodes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

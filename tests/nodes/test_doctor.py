@@ -1,7 +1,5 @@
 """``doctor``: this machine's packages and cameras."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

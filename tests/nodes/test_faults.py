@@ -1,7 +1,5 @@
 """Nodes that are killed or frozen come back and go on; launches end when that is no use; nothing is left behind."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Names of classes, cameras and files are text for every verb, whatever they hold; no secret of an address is shown."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Servers of pages: a request that cannot be answered is one line, and the next one is served."""
 
-from __future__ import annotations
-
 import socket
 from http.server import BaseHTTPRequestHandler
 

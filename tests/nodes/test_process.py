@@ -1,7 +1,5 @@
 """Process entry: thread counts, stop requests, stdout that holds results only."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """What a node says of itself always goes out, or is left out; it never ends the node."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Several camera nodes into one log, and what a node makes of several streams; real sockets and files."""
 
-from __future__ import annotations
-
 import json
 from contextlib import ExitStack
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``up``: real processes and sockets: the map of one process, orderly ends, clear errors, nothing left behind."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import signal

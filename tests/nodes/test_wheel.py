@@ -1,7 +1,5 @@
 """Launch files that come with the package, in a checkout and in a wheel."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Real ROS bags of both versions, written by ``rosbags`` from frames of a rendered room."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path

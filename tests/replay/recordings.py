@@ -1,7 +1,5 @@
 """Small recordings in each foreign format, written to disk."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from pathlib import Path

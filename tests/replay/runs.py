@@ -1,7 +1,5 @@
 """Runs to compare: walls that analytic depth is fused to, and sessions over frames of a room."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What ``bench`` measures, on a few frames of the log that ships."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

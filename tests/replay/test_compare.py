@@ -1,7 +1,5 @@
 """Comparing runs: each figure catches the difference it is there for, and a tolerance lets it pass."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth that is computed of a whole log, for those who need single frames of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A trajectory file moves the map of a session."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

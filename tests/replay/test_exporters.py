@@ -1,7 +1,5 @@
 """Logs in formats of other programs, read back by what reads these formats."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from base64 import b64decode

@@ -1,7 +1,5 @@
 """Folders of label images of a log's frames."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Iterator

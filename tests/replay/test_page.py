@@ -1,7 +1,5 @@
 """Reports: one well-formed page, whose pictures are inside and which asks nobody for anything."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """What Rerun shows: from where a map is looked at first, what moves, and the way of a camera that runs for days."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A map without metres gets them by a length that is known, whole or not at all."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Which map a path means, and what is said where no map is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The pytest plugin: replays in process, questions to their maps, stored runs, and that it costs nothing before."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The measure of the project's size."""
 
-from __future__ import annotations
-
 from tools import house
 
 

@@ -1,7 +1,5 @@
 """``docs/layouts.md`` shows what the readers read."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

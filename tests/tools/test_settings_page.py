@@ -1,7 +1,5 @@
 """``docs/settings.md`` says what the declarations say."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

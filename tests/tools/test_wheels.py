@@ -1,7 +1,5 @@
 """Wheels of all machines: what the check finds, and that the real ones pass it."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

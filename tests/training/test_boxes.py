@@ -1,7 +1,5 @@
 """Boxes that move: what is in them has its class where they are at the time, and leaves nothing where they were."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from functools import cache

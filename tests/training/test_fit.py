@@ -1,7 +1,5 @@
 """The loop of every fit: its budget, the looks at what is held out, and the weights that it keeps."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

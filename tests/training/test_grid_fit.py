@@ -1,7 +1,5 @@
 """Fitting grids: to images, from depth, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Fitting an Implicit Ray-Transformer: what stays, what is learned, what is refused."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace

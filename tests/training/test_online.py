@@ -1,7 +1,5 @@
 """Learning beside a mapper: which keyframes are kept, and which weights are worth offering."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import msgspec

@@ -1,7 +1,5 @@
 """Panoptic NeRF: what boxes and pseudo labels teach, what they do not, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

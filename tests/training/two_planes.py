@@ -1,7 +1,5 @@
 """A deck above the ground, seen from a ring of cameras: a scene that only its geometry tells apart."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from semantic_mapper.labels import make_label_set

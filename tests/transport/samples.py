@@ -1,7 +1,5 @@
 """Messages of every kind, small, and ways to spoil them."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Messages as bytes: exact round trips, and one clear error for anything else, before anything is allocated."""
 
-from __future__ import annotations
-
 import dataclasses
 import random
 import tracemalloc

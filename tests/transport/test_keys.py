@@ -1,7 +1,5 @@
 """Who has no key of a peer gets nothing, and nothing is bound beyond this machine without keys."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which running launch is meant, and that its mapper is found, and found again."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Folders that a killed process has left are removed; what is in use, and what is a user's own, never is."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

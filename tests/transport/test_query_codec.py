@@ -1,7 +1,5 @@
 """Questions and answers as bytes: exact round trips, and an error for anything else."""
 
-from __future__ import annotations
-
 import msgpack
 import numpy as np
 import pytest

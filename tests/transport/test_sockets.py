@@ -1,7 +1,5 @@
 """Publishers and subscribers over real sockets: delivery, restarts, floods, and messages beyond all limits."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Images of a printed board as a camera with a lens sees them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

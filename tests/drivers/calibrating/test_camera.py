@@ -1,7 +1,5 @@
 """A known camera is found again from pictures of a board; what cannot be believed is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the cameras of a rig sit is found again from boards that several of them see."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

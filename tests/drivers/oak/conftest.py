@@ -1,7 +1,5 @@
 """A calibration that DepthAI itself has written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Sources on the host in place of the device's: nodes that send given messages."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What of the device's part can be had without a device: its names in DepthAI, and calibrations."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import get_args

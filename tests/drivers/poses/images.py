@@ -1,7 +1,5 @@
 """Images and cameras for tests of poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import Self
 

@@ -1,7 +1,5 @@
 """RealSense cameras over the SDK's software device; only the list of connected devices is the tests' own."""
 
-from __future__ import annotations
-
 import time
 from itertools import islice, pairwise
 from typing import Any

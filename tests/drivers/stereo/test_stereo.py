@@ -1,7 +1,5 @@
 """Stereo pairs: rendered rooms through a real video file, and a webcam that goes away."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

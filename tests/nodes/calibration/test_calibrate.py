@@ -1,7 +1,5 @@
 """``calibrate``: from folders, videos and logs to files that drivers read."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The end of a stream reaches who came late, was suspended, or was too slow; real sockets."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

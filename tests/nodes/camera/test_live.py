@@ -1,7 +1,5 @@
 """The camera node over cameras: real drivers, sockets and video files; of V4L2 only the kernel is not real."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

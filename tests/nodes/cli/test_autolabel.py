@@ -1,7 +1,5 @@
 """``autolabel``: what it writes and keeps, that nobody scores on it, and what it does about bad input."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``compare``: what it prints and its exit codes, on folders that ``map`` has written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

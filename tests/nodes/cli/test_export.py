@@ -1,7 +1,5 @@
 """``export`` of maps and ``merge``, as commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Films on the command line: options, and what counts as a film."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``finetune`` and ``eval``."""
 
-from __future__ import annotations
-
 import json
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two machines that get to know each other, and a question from one to the other's mapper."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

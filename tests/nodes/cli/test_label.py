@@ -1,7 +1,5 @@
 """``label --suggest``, ``label --serve`` and ``finetune --labels``."""
 
-from __future__ import annotations
-
 import json
 import signal
 import urllib.request

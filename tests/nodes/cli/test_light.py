@@ -1,7 +1,5 @@
 """What needs neither torch nor Open3D does not load them: it starts in half a second instead of three."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``info`` of maps."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

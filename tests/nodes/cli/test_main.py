@@ -1,7 +1,5 @@
 """The command as such: help, usage errors, versions."""
 
-from __future__ import annotations
-
 import pytest
 from typer.testing import CliRunner
 

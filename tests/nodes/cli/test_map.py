@@ -1,7 +1,5 @@
 """``map`` and ``demo``: what they write and say, and what they do about bad input and folders that others use."""
 
-from __future__ import annotations
-
 import json
 import signal
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``finetune --kind panoptic`` on a log, and what ``autolabel`` makes of it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

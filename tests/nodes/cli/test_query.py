@@ -1,7 +1,5 @@
 """The command on a saved map of a known scene, and ``query MAP relocalize LOG``."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

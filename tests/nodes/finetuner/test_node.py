@@ -1,7 +1,5 @@
 """The finetuner node in this process: keyframes in, weights out, beside a mapper or one that the test plays."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Stores with made-up results."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path

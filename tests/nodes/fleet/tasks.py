@@ -1,7 +1,5 @@
 """What workers do in tests of the driver; the folder to leave traces in comes as a tag."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Ray clusters: one of this machine is on loopback with a token, others need one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """The release gate: what it calls worse, what it does not, and how sure it is."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Maps of one building fused into one: with given poses, with found ones, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Runs of a fleet: what a worker makes of one log, and the driver on a real Ray cluster in this machine."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections.abc import Iterator

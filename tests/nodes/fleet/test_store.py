@@ -1,7 +1,5 @@
 """Stores in folders and buckets: one result counts, whole or not at all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

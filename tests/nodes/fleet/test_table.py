@@ -1,7 +1,5 @@
 """Results as tables: rows and columns, and SQL that cannot leave them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

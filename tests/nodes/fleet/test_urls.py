@@ -1,7 +1,5 @@
 """Paths and URLs: what opens them, which logs they mean, and that no message shows what lets anybody in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

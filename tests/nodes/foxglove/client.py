@@ -1,7 +1,5 @@
 """A client of Foxglove's websocket protocol (subprotocol foxglove.sdk.v1)."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

@@ -1,7 +1,5 @@
 """A robot as Foxglove sees it: a camera's and a mapper's topics, and the questions about a known map."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager

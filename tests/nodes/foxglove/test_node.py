@@ -1,7 +1,5 @@
 """What Foxglove receives of a robot, read with Foxglove's own classes."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import socket

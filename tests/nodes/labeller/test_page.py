@@ -1,7 +1,5 @@
 """The labelling page in a headless browser: strokes of mouse, keys and finger become label images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

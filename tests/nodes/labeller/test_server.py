@@ -1,7 +1,5 @@
 """The labelling page over HTTP: who may, what it takes, what it writes."""
 
-from __future__ import annotations
-
 import http.client
 import json
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Launch files: those of the package, what is accepted, what is refused, and how the refusal helps."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a launcher knows of a node from its heartbeats, and limits that count while nothing gets on."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

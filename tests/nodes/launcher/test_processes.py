@@ -1,7 +1,5 @@
 """Node processes: started, restarted, ended, and nothing left behind; real processes and real limits."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

@@ -1,7 +1,5 @@
 """What is said where nobody can answer, and what `view --status` makes of statuses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from unittest.mock import Mock
 

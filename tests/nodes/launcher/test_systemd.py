@@ -1,7 +1,5 @@
 """Where there is no systemd, and the unit file; what systemd receives: tests/nodes/test_faults.py."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

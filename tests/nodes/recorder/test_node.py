@@ -1,7 +1,5 @@
 """The recorder node against real sockets: splits, full disk, packing, attachments; and ``record`` from outside."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

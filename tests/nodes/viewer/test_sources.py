@@ -1,7 +1,5 @@
 """What the viewer is shown, and who can see it and be spoken to by it."""
 
-from __future__ import annotations
-
 import dataclasses
 import http.client
 import json

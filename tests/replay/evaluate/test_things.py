@@ -1,7 +1,5 @@
 """The finished map with its things against true classes and objects of its frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

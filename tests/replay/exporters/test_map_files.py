@@ -1,7 +1,5 @@
 """A real map, exported and read back: options reach the file, and those that mean nothing are refused."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from pathlib import Path

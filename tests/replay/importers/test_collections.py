@@ -1,7 +1,5 @@
 """Posed picture collections: transforms.json, COLMAP, Polycam, Record3D, OpenSfM."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

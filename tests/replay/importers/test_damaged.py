@@ -1,7 +1,5 @@
 """One bad value costs what it is of, and is named; what concerns all frames stops the import with what to do."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Sequence folders, TUM, ScanNet, Replica and KITTI-360: right values of what they hold."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from datetime import UTC, datetime

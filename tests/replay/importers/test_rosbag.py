@@ -1,7 +1,5 @@
 """ROS bags of both versions, as robots record them: right values, and what cannot be true."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Logs as they are written, cut off, damaged, and made by other tools: what is whole is read, and nothing else."""
 
-from __future__ import annotations
-
 import random
 import signal
 import struct

@@ -1,7 +1,5 @@
 """Frames that a log is missing."""
 
-from __future__ import annotations
-
 from semantic_mapper.replay.log.missing_frames import find_missing_frames, missing_frames_text
 
 TENTH = 10**8

@@ -1,7 +1,5 @@
 """Recordings in parts; disks that are full, by the kernel's word and by our own reserve."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Films for tests: walks through a drawn room, and mp4 files changed as phones write them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where a reconstruction begins: cameras that go straight ahead, and cameras that only turn; features, no pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

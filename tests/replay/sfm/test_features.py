@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 
 from semantic_mapper.replay.sfm.colmap_process import loop_pairs

@@ -1,7 +1,5 @@
 """Pictures that say where they were taken, and models that are placed by that."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

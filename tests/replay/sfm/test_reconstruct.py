@@ -1,7 +1,5 @@
 """Whole films: a walk through a drawn room comes out as it was walked, and what cannot be reconstructed is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

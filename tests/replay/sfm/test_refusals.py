@@ -1,7 +1,5 @@
 """What a film cannot be mapped from is refused with what to do, and what it tells badly is noted."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import pytest
