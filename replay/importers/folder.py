@@ -14,18 +14,9 @@ from msgspec import Meta
 
 from semantic_mapper.errors import ImportSourceError, LabelError
 from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import DEPTHS, PICTURES, DepthScale, ImportOptions, camera_of, first_size
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    convert_known,
-    numbered_files,
-    read_plain_json,
-    read_pose_rows,
-    read_stamps,
-    refuse_keys,
-    unknown_notice,
-    without_picture,
-)
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import CameraIntrinsics
 
@@ -63,15 +54,15 @@ def open_folder(folder: Path, options: ImportOptions) -> PosedPictures:
     Raises ImportSourceError: a file that concerns all frames is missing or cannot be understood.
     """
     notices: list[str] = []
-    color = numbered_files(folder / "color", PICTURES, notices)
+    color = tables.numbered_files(folder / "color", PICTURES, notices)
     if not color:
         raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
     lens, given, scale_from = read_intrinsics(folder / "intrinsics.json", notices, list(color.values()))
-    poses = read_pose_rows(folder / "poses.txt", color.keys())
-    notices += without_picture("row of poses.txt", poses, color, folder / "color")
-    stamps = read_stamps(folder / "timestamps.txt", max(color) + 1, DEFAULT_HZ, notices)
+    poses = tables.read_pose_rows(folder / "poses.txt", color.keys())
+    notices += tables.without_picture("row of poses.txt", poses, color, folder / "color")
+    stamps = tables.read_stamps(folder / "timestamps.txt", max(color) + 1, DEFAULT_HZ, notices)
     depth, computed, sigma, labels, pseudo = (
-        numbered_files(folder / name, suffixes, notices)
+        tables.numbered_files(folder / name, suffixes, notices)
         for name, suffixes in (
             ("depth", DEPTHS),
             (COMPUTED_DEPTH, (".png",)),
@@ -115,7 +106,7 @@ def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
     ``notices`` gets a sentence on what had to be assumed of the id that means unknown. Raises ImportSourceError:
     missing, or no label set.
     """
-    labels = convert_known(read_plain_json(file), _Labels, file)
+    labels = tables.convert_known(tables.read_plain_json(file), _Labels, file)
     try:
         label_set = _label_set(labels, file.resolve().parent.name)
     except (LabelError, ValueError) as error:
@@ -156,10 +147,10 @@ def read_intrinsics(
     The first of ``pictures`` that can be read tells the size where the file does not. ``notices`` gets a sentence on
     keys that are not read. Raises ImportSourceError: missing, or a value that cannot be.
     """
-    plain = read_plain_json(file)
-    i = convert_known(plain, _Intrinsics, file)
-    refuse_keys({key: value for key, value in plain.items() if key != "distortion"}, _OTHER_LENS, file)
-    notices += unknown_notice(file, [plain], _Intrinsics)
+    plain = tables.read_plain_json(file)
+    i = tables.convert_known(plain, _Intrinsics, file)
+    tables.refuse_keys({key: value for key, value in plain.items() if key != "distortion"}, _OTHER_LENS, file)
+    notices += tables.unknown_notice(file, [plain], _Intrinsics)
     if i.depth_scale is not None and i.depth_scale < 1:
         raise ImportSourceError(
             f"{file}: depth_scale {i.depth_scale:g} is no number of units per metre; where it is metres per unit, "

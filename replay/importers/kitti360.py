@@ -19,6 +19,7 @@ from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import camera_matrix, invert_pose, transform
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
@@ -30,14 +31,6 @@ from semantic_mapper.replay.importers.base import (
     read_plane,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    left_out_notice,
-    numbered_files,
-    read_lines,
-    read_numbers,
-    read_stamps,
-    split_row,
-)
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERAS = ("image_00", "image_01")
@@ -73,7 +66,7 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     notices: list[str] = []
     root, drive = find_drive(folder)
     raw, semantics = root / "data_2d_raw" / drive, root / "data_2d_semantics" / "train" / drive
-    files = {name: numbered_files(raw / name / "data_rect", (".png",), notices) for name in CAMERAS}
+    files = {name: tables.numbered_files(raw / name / "data_rect", (".png",), notices) for name in CAMERAS}
     cameras = [name for name in CAMERAS if files[name]]
     if not cameras:
         raise ImportSourceError(
@@ -82,20 +75,20 @@ def open_kitti360(folder: Path, options: ImportOptions) -> PosedPictures:
     calibration = root / "calibration" / "perspective.txt"
     rectified = {name: _rectified_camera(calibration, name[-2:]) for name in cameras}
     scans_folder = root / "data_3d_raw" / drive / "velodyne_points" / "data"
-    scans = numbered_files(scans_folder, (".bin",), notices)
+    scans = tables.numbered_files(scans_folder, (".bin",), notices)
     if not scans:
         notices.append(f"no laser scans of {scans_folder}: frames come without depth")
     T_cam0_scanner = _scanner_pose(calibration) if scans else np.eye(4)
     poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
     poses = _read_poses(poses_file, notices)
-    labels = {name: numbered_files(semantics / name / "semantic", (".png",), notices) for name in cameras}
+    labels = {name: tables.numbered_files(semantics / name / "semantic", (".png",), notices) for name in cameras}
     if not any(labels.values()):
         notices.append(f"no labels: {semantics} has no semantic/; test drives have none")
 
     pictures: list[PosedPicture] = []
     for name in cameras:
         intrinsics, T_cam0_camera = rectified[name]
-        stamps = read_stamps(raw / name / "timestamps.txt", max(files[name]) + 1, NOMINAL_HZ, notices)
+        stamps = tables.read_stamps(raw / name / "timestamps.txt", max(files[name]) + 1, NOMINAL_HZ, notices)
         for number, file in files[name].items():
             pose = poses.get(number)
             if pose is None:
@@ -143,9 +136,9 @@ def _read_poses(file: Path, notices: list[str]) -> dict[int, Float64]:
     """``T_world_cam0`` by the number of the image."""
     poses: dict[int, Float64] = {}
     bad: list[str] = []
-    for line, text in read_lines(file):
+    for line, text in tables.read_lines(file):
         try:
-            index, *numbers = split_row(text)
+            index, *numbers = tables.split_row(text)
             T_world_cam0 = np.array([float(n) for n in numbers], np.float64).reshape(4, 4)
             poses.setdefault(int(float(index)), T_world_cam0)
         except (ValueError, OverflowError) as error:
@@ -155,7 +148,7 @@ def _read_poses(file: Path, notices: list[str]) -> dict[int, Float64]:
             f"{file}: holds no pose: no row of a frame number and the 16 numbers of a 4x4 matrix"
             f"{' (' + bad[0] + ')' if bad else ''}; poses.txt, with 12, is another file"
         )
-    notices += left_out_notice("pose", bad)
+    notices += tables.left_out_notice("pose", bad)
     return poses
 
 
@@ -178,11 +171,11 @@ def find_drive(folder: Path) -> tuple[Path, str]:
 
 def _calibrated(file: Path, name: str, count: int) -> Float64:
     """Numbers of the line of a calibration file that begins with a name, or of the only line, without one."""
-    for _, text in read_lines(file):
+    for _, text in tables.read_lines(file):
         label, colon, numbers = text.rpartition(":")
         if label.strip() == name and (colon or not name):
             with suppress(ValueError):
-                values = np.array(read_numbers(numbers), np.float64)
+                values = np.array(tables.read_numbers(numbers), np.float64)
                 if len(values) == count and np.isfinite(values).all():
                     return values
     wanted = f"'{name}:' with {count} numbers" if name else f"{count} numbers"

@@ -21,16 +21,9 @@ from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import numeric_order
 from semantic_mapper.geometry import invert_pose, project, transform
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import PICTURES, BadFrameError, DepthScale, ImportOptions, camera_of
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    convert_known,
-    inside,
-    keep_good,
-    left_out_notice,
-    read_plain_json,
-    unknown_notice,
-)
 from semantic_mapper.replay.sfm.colmap import ColmapImage, ColmapModel, find_models, read_model
 from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition, place_by_gps, read_position
 from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, scene_depth, upright
@@ -52,12 +45,12 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     place, model = _largest(folder, notices)
     roots = (folder / "images", *(parent / "images" for parent in place.parents[:3]), folder)
     root = _root(folder, roots, [image.name for image in model.images])
-    notices += left_out_notice("image", model.left_out)
+    notices += tables.left_out_notice("image", model.left_out)
 
     def picture_of(image: ColmapImage) -> PosedPicture:
-        return PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
+        return PosedPicture(tables.inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
 
-    pictures = keep_good(picture_of, model.images, "image", notices)
+    pictures = tables.keep_good(picture_of, model.images, "image", notices)
     return _opened("colmap", folder, pictures, model.xyz, options, notices)
 
 
@@ -66,7 +59,7 @@ def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
     places = find_models(folder)
     if not places:
         raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
-    models = dict(keep_good(lambda place: (place, read_model(place)), places, "model", notices))
+    models = dict(tables.keep_good(lambda place: (place, read_model(place)), places, "model", notices))
     chosen = max(models, key=lambda place: len(models[place].images), default=places[0])
     if not models or not models[chosen].images:
         raise ImportSourceError("; ".join((f"{places[0]}: the model has no registered image", *notices)))
@@ -136,11 +129,11 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     file = find_opensfm(folder)
     if file is None:
         raise ImportSourceError(f"{folder}: no {FILE} in it, or below opensfm/")
-    parts = [convert_known(part, _Reconstruction, file) for part in read_plain_json(file, list)]
+    parts = [tables.convert_known(part, _Reconstruction, file) for part in tables.read_plain_json(file, list)]
     model = max(parts, key=lambda part: len(part.shots), default=_Reconstruction())
     if not model.shots:
         raise ImportSourceError(f"{file}: holds no posed picture")
-    notices = unknown_notice(file, model.cameras.values(), _Camera)
+    notices = tables.unknown_notice(file, model.cameras.values(), _Camera)
     if len(parts) > 1:
         others = ", ".join(str(len(part.shots)) for part in parts if part is not model)
         notices.append(
@@ -153,7 +146,7 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     def picture_of(name: str) -> PosedPicture:
         return _opensfm_picture(root, name, model, f"{file}, shot '{name}'")
 
-    pictures = keep_good(picture_of, names, "picture", notices)
+    pictures = tables.keep_good(picture_of, names, "picture", notices)
     points = np.array([point.coordinates for point in model.points.values()], np.float64).reshape(-1, 3)
     origin = None
     if model.reference_lla is not None and (model.reference_lla.latitude or model.reference_lla.longitude):
@@ -164,16 +157,18 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _opensfm_picture(root: Path, name: str, model: _Reconstruction, where: str) -> PosedPicture:
-    shot = convert_known(model.shots[name], _Shot, where)
+    shot = tables.convert_known(model.shots[name], _Shot, where)
     if shot.camera not in model.cameras:
         raise ImportSourceError(f"{where}: its camera '{shot.camera}' is missing")
-    camera = convert_known(model.cameras[shot.camera], _Camera, f"{where}, camera '{shot.camera}'")
+    camera = tables.convert_known(model.cameras[shot.camera], _Camera, f"{where}, camera '{shot.camera}'")
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
     T_camera_world[:3, 3] = shot.translation
     time = shot.capture_time
     stamp_ns = round(time * 1e9) if type(time) in (int, float) and 0 < time < MAX_STAMP_NS / 1e9 else None
-    return PosedPicture(inside(root, name), _opensfm_intrinsics(camera, where), invert_pose(T_camera_world), stamp_ns)
+    return PosedPicture(
+        tables.inside(root, name), _opensfm_intrinsics(camera, where), invert_pose(T_camera_world), stamp_ns
+    )
 
 
 def _opensfm_intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
@@ -204,14 +199,14 @@ def _root(folder: Path, roots: tuple[Path, ...], names: list[str]) -> Path:
     found = {root: sum(_is_picture(root, name) for name in names) for root in roots}
     root = max(roots, key=lambda root: found[root])
     if not found[root]:
-        inside(root, names[0])  # tells of a name that leads out of it
+        tables.inside(root, names[0])  # tells of a name that leads out of it
         raise ImportSourceError(f"{folder}: the pictures are missing; '{names[0]}' is not in {root}")
     return root
 
 
 def _is_picture(root: Path, name: str) -> bool:
     try:
-        return inside(root, name).is_file()
+        return tables.inside(root, name).is_file()
     except (ImportSourceError, OSError):  # its name leads out of the folder, or cannot be one
         return False
 
@@ -231,7 +226,7 @@ def _opened(
     names = {picture.file for picture in pictures}
     there = (file for place in {file.parent for file in names} for file in place.iterdir())
     unposed = sorted(str(file) for file in there if file.suffix.lower() in PICTURES and file not in names)
-    notices += left_out_notice("picture", unposed, "without a pose in this model")
+    notices += tables.left_out_notice("picture", unposed, "without a pose in this model")
     poses = np.stack([picture.pose for picture in pictures if not isinstance(picture.pose, BadFrameError)])
     scale_from, scale, depth = "GPS, by OpenSfM", 1.0, _median_depth(points, pictures, poses)
     fit = None

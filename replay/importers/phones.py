@@ -21,6 +21,7 @@ import numpy as np
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import (
     PICTURES,
     BadFrameError,
@@ -30,16 +31,6 @@ from semantic_mapper.replay.importers.base import (
     first_size,
 )
 from semantic_mapper.replay.importers.posed import GL_AXES, T_Z_UP_Y_UP, PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    MAX_NORM_ERROR,
-    convert_known,
-    keep_good,
-    numbered_files,
-    read_plain_json,
-    refuse_keys,
-    unknown_notice,
-    without_picture,
-)
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 POLYCAM_SCALE = DepthScale(1000.0, convention="Polycam's millimetres")
@@ -68,33 +59,33 @@ def open_polycam(folder: Path, options: ImportOptions) -> PosedPictures:
     """A capture of Polycam, opened. Raises ImportSourceError: no pictures, or none with a camera that can be used."""
     keyframes = folder / "keyframes"
     notices: list[str] = []
-    images = numbered_files(keyframes / "corrected_images", PICTURES, notices)
+    images = tables.numbered_files(keyframes / "corrected_images", PICTURES, notices)
     kind = "corrected_"
     if not images or not (keyframes / "corrected_cameras").is_dir():
-        images, kind = numbered_files(keyframes / "images", PICTURES, notices), ""
+        images, kind = tables.numbered_files(keyframes / "images", PICTURES, notices), ""
         notices.append("no corrected_images: poses are ARKit's own, and the lens distortion is not undone")
     if not images:
         raise ImportSourceError(f"{keyframes / 'images'}: no pictures; export 'raw data' (developer mode)")
-    cameras = numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
-    notices += without_picture("camera", cameras, images, keyframes / f"{kind}images")
-    tables: list[dict[str, Any]] = []
+    cameras = tables.numbered_files(keyframes / f"{kind}cameras", (".json",), notices)
+    notices += tables.without_picture("camera", cameras, images, keyframes / f"{kind}images")
+    files: list[dict[str, Any]] = []
 
     def picture_of(timed: tuple[int, Path]) -> PosedPicture:
         time_us, image = timed
         file = keyframes / f"{kind}cameras" / f"{image.stem}.json"
-        tables.append(read_plain_json(file))
-        refuse_keys(tables[-1], _POLYCAM_LENS, file)
-        c = convert_known(tables[-1], _Camera, file)
+        files.append(tables.read_plain_json(file))
+        tables.refuse_keys(files[-1], _POLYCAM_LENS, file)
+        c = tables.convert_known(files[-1], _Camera, file)
         size = (c.width, c.height) if c.width and c.height else first_size([image], file)
         intrinsics = camera_of(file, (c.fx, c.fy, c.cx - 0.5, c.cy - 0.5), size)
         T_world_gl = np.eye(4)
-        T_world_gl[:3] = np.reshape(msgspec.structs.astuple(convert_known(tables[-1], _Pose, file)), (3, 4))
+        T_world_gl[:3] = np.reshape(msgspec.structs.astuple(tables.convert_known(files[-1], _Pose, file)), (3, 4))
         T = T_Z_UP_Y_UP @ T_world_gl @ GL_AXES
         depth, confidence = (keyframes / name / f"{image.stem}.png" for name in ("depth", "confidence"))
         return PosedPicture(image, intrinsics, T, 1000 * (time_us - min(images)), depth, confidence)
 
-    pictures = keep_good(picture_of, images.items(), "picture", notices, "without a camera that can be used")
-    notices += unknown_notice(keyframes / f"{kind}cameras", tables, _Camera, _POLYCAM_KNOWN)
+    pictures = tables.keep_good(picture_of, images.items(), "picture", notices, "without a camera that can be used")
+    notices += tables.unknown_notice(keyframes / f"{kind}cameras", files, _Camera, _POLYCAM_KNOWN)
     return PosedPictures(f"polycam {folder.resolve().name}", pictures, options, POLYCAM_SCALE, notices)
 
 
@@ -116,13 +107,13 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
     Raises ImportSourceError: metadata or pictures are missing or cannot be understood.
     """
     file = folder / "metadata.json"
-    plain = read_plain_json(file)
-    found = convert_known({key: value for key, value in plain.items() if value is not None}, _Metadata, file)
-    notices = unknown_notice(file, [plain], _Metadata, _RECORD3D_KNOWN)
-    images = numbered_files(folder / "rgb", PICTURES, notices)
+    plain = tables.read_plain_json(file)
+    found = tables.convert_known({key: value for key, value in plain.items() if value is not None}, _Metadata, file)
+    notices = tables.unknown_notice(file, [plain], _Metadata, _RECORD3D_KNOWN)
+    images = tables.numbered_files(folder / "rgb", PICTURES, notices)
     if not images:
         raise ImportSourceError(f"{folder / 'rgb'}: no pictures; export as 'EXR + RGB'")
-    notices += without_picture("pose", range(len(found.poses)), images, folder / "rgb")
+    notices += tables.without_picture("pose", range(len(found.poses)), images, folder / "rgb")
     if (folder / "depth").is_dir():
         notices.append("the depth images (OpenEXR) are not read; frames come without depth")
     seconds = _seconds(found, list(images), file, notices)
@@ -133,7 +124,7 @@ def open_record3d(folder: Path, options: ImportOptions) -> PosedPictures:
             image, _record3d_intrinsics(found, number, image), _record3d_pose(found, number, image), round(second * 1e9)
         )
 
-    pictures = keep_good(picture_of, zip(images.items(), seconds, strict=True), "picture", notices)
+    pictures = tables.keep_good(picture_of, zip(images.items(), seconds, strict=True), "picture", notices)
     return PosedPictures(f"record3d {folder.resolve().name}", pictures, options, RECORD3D_SCALE, notices)
 
 
@@ -148,7 +139,7 @@ def _numbers(rows: list[Any], number: int, count: int) -> Float64 | None:
 
 def _record3d_pose(found: _Metadata, number: int, image: Path) -> Float64:
     row = _numbers(found.poses, number, 7)
-    if row is None or abs(np.linalg.norm(row[:4]) - 1) > MAX_NORM_ERROR:
+    if row is None or abs(np.linalg.norm(row[:4]) - 1) > tables.MAX_NORM_ERROR:
         raise BadFrameError(image, "its pose is missing, or no unit quaternion qx qy qz qw and position")
     return T_Z_UP_Y_UP @ pose_matrix(row[4:], row[:4]) @ GL_AXES
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from semantic_mapper.errors import ImportSourceError, LabelError
 from semantic_mapper.labels import NYU40, LabelSet, make_label_set
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import (
     DEPTHS,
     PICTURES,
@@ -40,14 +41,6 @@ from semantic_mapper.replay.importers.base import (
     read_rgb,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    convert_known,
-    numbered_files,
-    read_matrix,
-    read_plain_json,
-    read_pose_rows,
-    without_picture,
-)
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 SCANNET_SCALE = DepthScale(1000.0, convention="ScanNet's millimetres")
@@ -61,17 +54,17 @@ def open_scannet(folder: Path, options: ImportOptions) -> PosedPictures:
     Raises ImportSourceError: intrinsics or images are missing.
     """
     notices: list[str] = []
-    color = numbered_files(folder / "color", PICTURES, notices)
-    depth = numbered_files(folder / "depth", DEPTHS, notices)
-    poses = numbered_files(folder / "pose", (".txt",), notices)
-    notices += without_picture("pose", poses, color, folder / "color")
+    color = tables.numbered_files(folder / "color", PICTURES, notices)
+    depth = tables.numbered_files(folder / "depth", DEPTHS, notices)
+    poses = tables.numbered_files(folder / "pose", (".txt",), notices)
+    notices += tables.without_picture("pose", poses, color, folder / "color")
     names = [name for name in ("label-filt", "label") if (folder / name).is_dir()]
-    labels = numbered_files(folder / names[0], (".png",), notices) if names else {}
+    labels = tables.numbered_files(folder / names[0], (".png",), notices) if names else {}
     own = _scannet_intrinsics(folder, "color", color.values())
     view = None if options.without_depth else _scannet_intrinsics(folder, "depth", depth.values())
     for which in ("color", "depth"):
         file = folder / "intrinsic" / f"extrinsic_{which}.txt"
-        if file.exists() and not np.allclose(read_matrix(file), np.eye(4), atol=5e-3):
+        if file.exists() and not np.allclose(tables.read_matrix(file), np.eye(4), atol=5e-3):
             notices.append(f"{file.name} is not the identity; it is ignored, colour may be off by its parallax")
     pictures = [
         PosedPicture(
@@ -104,7 +97,7 @@ def open_scannet(folder: Path, options: ImportOptions) -> PosedPictures:
 
 def _scannet_pose(file: Path) -> Float64 | BadFrameError:
     try:
-        pose = read_matrix(file)
+        pose = tables.read_matrix(file)
     except BadFrameError as error:
         return error
     lost = BadFrameError(file, "the scanner had lost track of its pose here (-inf)")
@@ -130,7 +123,7 @@ def _scannet_table(folder: Path) -> UInt8 | None:
 def _scannet_intrinsics(folder: Path, which: str, images: Iterable[Path]) -> CameraIntrinsics:
     places = (folder / "intrinsic" / f"intrinsic_{which}.txt", folder / f"intrinsics_{which}.txt")
     file = next((place for place in places if place.exists()), places[0])
-    K = read_matrix(file)
+    K = tables.read_matrix(file)
     if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]) or np.any(np.abs(K[[1, 2, 2], [0, 0, 1]]) > 1e-9):
         raise ImportSourceError(f"{file}: is no matrix of a camera without skew, which is the one that is read")
     for image in images:
@@ -166,11 +159,11 @@ class _Info(msgspec.Struct):
 def open_replica(folder: Path, options: ImportOptions) -> PosedPictures:
     """A sequence, opened; one frame for each colour image. Raises ImportSourceError: images or poses are missing."""
     notices: list[str] = []
-    color = numbered_files(folder / "rgb", (".png",), notices)
-    depth = numbered_files(folder / "depth", DEPTHS, notices)
-    labels = numbered_files(folder / "semantic_class", (".png",), notices)
-    poses = read_pose_rows(folder / "traj_w_c.txt", color.keys())
-    notices += without_picture("depth image", depth, color, folder / "rgb")
+    color = tables.numbered_files(folder / "rgb", (".png",), notices)
+    depth = tables.numbered_files(folder / "depth", DEPTHS, notices)
+    labels = tables.numbered_files(folder / "semantic_class", (".png",), notices)
+    poses = tables.read_pose_rows(folder / "traj_w_c.txt", color.keys())
+    notices += tables.without_picture("depth image", depth, color, folder / "rgb")
     size = first_size(color.values(), folder / "rgb")
     f = size[0] / 2 / np.tan(np.deg2rad(REPLICA_HFOV_DEG) / 2)
     intrinsics = camera_of(folder / "rgb", (f, f, (size[0] - 1) / 2, (size[1] - 1) / 2), size)
@@ -206,11 +199,11 @@ def open_nice_slam(folder: Path, options: ImportOptions) -> PosedPictures:
     notices: list[str] = []
     here = folder.resolve()
     file = next((f for f in (here / _PARAMS, here.parent / _PARAMS) if f.exists()), here.parent / _PARAMS)
-    k = convert_known(read_plain_json(file).get("camera"), _Camera, file)
+    k = tables.convert_known(tables.read_plain_json(file).get("camera"), _Camera, file)
     intrinsics = camera_of(file, (k.fx, k.fy, k.cx, k.cy), (k.w, k.h))
-    color = numbered_files(folder / "results", (".jpg",), notices)
-    depth = numbered_files(folder / "results", (".png",), notices)
-    poses = read_pose_rows(folder / "traj.txt", color.keys())
+    color = tables.numbered_files(folder / "results", (".jpg",), notices)
+    depth = tables.numbered_files(folder / "results", (".png",), notices)
+    poses = tables.read_pose_rows(folder / "traj.txt", color.keys())
     pictures = [
         PosedPicture(image, intrinsics, poses[number], round(number * 1e9 / REPLICA_HZ), depth.get(number), seq=number)
         for number, image in color.items()
@@ -228,7 +221,9 @@ def _replica_labels(here: Path, notices: list[str]) -> LabelSet | None:
             f"{', '.join(map(str, places))}; Replica has it for each scene"
         )
         return None
-    classes = {c.id: c.name for c in convert_known(read_plain_json(file), _Info, file).classes if c.id > 0}
+    classes = {
+        c.id: c.name for c in tables.convert_known(tables.read_plain_json(file), _Info, file).classes if c.id > 0
+    }
     try:
         return make_label_set("replica", list(classes.values()), ids=list(classes))
     except LabelError as error:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import CodecError, ImportSourceError
 from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
+from semantic_mapper.replay.importers import ros_bags
 from semantic_mapper.replay.importers.base import (
     MATCH_NS,
     BadFrameError,
@@ -27,21 +28,6 @@ from semantic_mapper.replay.importers.base import (
     same_view,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, depth_of_size
-from semantic_mapper.replay.importers.ros_bags import (
-    CAMERA_INFO,
-    LISTED,
-    POSES,
-    TF,
-    UNITS_PER_M,
-    Bag,
-    Calibration,
-    Topic,
-    color_image,
-    compressed_depth_image,
-    compressed_image,
-    depth_image,
-    frame_name,
-)
 from semantic_mapper.replay.importers.ros_transforms import (
     WORLD_FRAMES,
     PoseSeries,
@@ -57,7 +43,7 @@ from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float
 DecodedT = TypeVar("DecodedT")
 
 ROLES = ("image", "depth", "info", "depth_info", "pose")
-DEPTH_SCALE = DepthScale(UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
+DEPTH_SCALE = DepthScale(ros_bags.UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
 
 _SAME_PLACE = 1e-6  # of a transform's entries; cameras that are closer are one
 _SAME_LENS = 0.005  # fraction of focal length and width that two calibrations of one lens differ by at most
@@ -88,17 +74,17 @@ class _BagReader:
         unknown = sorted(set(options.topics) - set(ROLES))
         if unknown:
             raise ImportSourceError(f"no topic has the role '{unknown[0]}'; the roles are {', '.join(ROLES)}")
-        self._bag = Bag(src)
+        self._bag = ros_bags.Bag(src)
         self._color, self._depth = self._find_images()
-        if not self._bag.topics(*POSES, *TF):
-            kinds = ", ".join(t.replace("/msg/", "/") for t in POSES)
+        if not self._bag.topics(*ros_bags.POSES, *ros_bags.TF):
+            kinds = ", ".join(t.replace("/msg/", "/") for t in ros_bags.POSES)
             hint = _VIEWER if self._color.name.startswith(_REALSENSE_VIEWER) else ""
             raise ImportSourceError(
                 f"has no poses: neither tf nor a topic of {kinds}; it has {self._bag.listing()}{hint}"
             )
         info, depth_info = self._info_topic(self._color, "info"), ""
         if self._depth is not None:
-            own = "depth_info" in options.topics or _info_name(self._depth) in self._bag.topics(CAMERA_INFO)
+            own = "depth_info" in options.topics or _info_name(self._depth) in self._bag.topics(ros_bags.CAMERA_INFO)
             depth_info = self._info_topic(self._depth, "depth_info") if own else ""
         self._read_all()
         self._frame = self._color.frame or self._calibrations[info][0].frame
@@ -138,18 +124,18 @@ class _BagReader:
             read_depth=self._depth_m,
         )
 
-    def _decoded(self, topic: Topic, file: Path, decode: Callable[[Any], DecodedT]) -> DecodedT:
+    def _decoded(self, topic: ros_bags.Topic, file: Path, decode: Callable[[Any], DecodedT]) -> DecodedT:
         try:
             return decode(self._bag.message(topic.name, self._received[topic.name], int(file.name)))
         except CodecError as error:
             raise BadFrameError(file, str(error)) from error
 
     def _rgb(self, file: Path) -> tuple[UInt8, EncodedImage | None]:
-        return self._decoded(self._color, file, color_image if self._color.raw else compressed_image)
+        return self._decoded(self._color, file, ros_bags.color_image if self._color.raw else ros_bags.compressed_image)
 
     def _depth_m(self, picture: PosedPicture, lens: Rectifier) -> Float32:
         assert self._depth is not None and picture.depth_file is not None
-        decode = depth_image if self._depth.raw else compressed_depth_image
+        decode = ros_bags.depth_image if self._depth.raw else ros_bags.compressed_depth_image
         depth_m = self._decoded(self._depth, picture.depth_file, decode)
         if self._registration is None:
             size = (lens.intrinsics.height, lens.intrinsics.width)
@@ -165,7 +151,7 @@ class _BagReader:
         points = transform(T_color_depth, unproject(depth_m, own)[depth_m > 0])
         return depth_of_points(points, lens.intrinsics)
 
-    def _find_images(self) -> tuple[Topic, Topic | None]:
+    def _find_images(self) -> tuple[ros_bags.Topic, ros_bags.Topic | None]:
         """The topics of colour and of depth."""
         topics, wanted = self._bag.image_topics(), self._options.topics
         depths = [t for t in topics if t.is_depth]
@@ -174,7 +160,9 @@ class _BagReader:
         color = self._choose("image", colors, [t for t in fitting if not t.is_grey] or fitting)
         left = [str(t) for t in fitting if t != color]
         if "image" not in wanted and left:
-            self.notices.append(f"images are those of {color.name}; there are also {', '.join(left[:LISTED])}")
+            self.notices.append(
+                f"images are those of {color.name}; there are also {', '.join(left[: ros_bags.LISTED])}"
+            )
         if self._options.without_depth:
             return color, None
         fitting = _without_doubles(depths)
@@ -183,7 +171,7 @@ class _BagReader:
             return color, None
         return color, self._choose("depth", depths, [t for t in fitting if t.frame == color.frame] or fitting)
 
-    def _choose(self, role: str, topics: list[Topic], fitting: list[Topic]) -> Topic:
+    def _choose(self, role: str, topics: list[ros_bags.Topic], fitting: list[ros_bags.Topic]) -> ros_bags.Topic:
         """The one of the topics that is named, or else the only one that fits."""
         name = self._named(role, [topic.name for topic in topics])
         found = [topic for topic in topics if topic.name == name] or fitting
@@ -198,20 +186,20 @@ class _BagReader:
         name = self._options.topics.get(role, "")
         if name and name not in names:
             raise ImportSourceError(
-                f"no topic '{name}' fits the {role}; there are {', '.join(names[:LISTED]) or 'none'}"
+                f"no topic '{name}' fits the {role}; there are {', '.join(names[: ros_bags.LISTED]) or 'none'}"
             )
         return name
 
-    def _info_topic(self, topic: Topic, role: str) -> str:
+    def _info_topic(self, topic: ros_bags.Topic, role: str) -> str:
         """The topic of the calibration of images."""
-        infos = self._bag.topics(CAMERA_INFO)
+        infos = self._bag.topics(ros_bags.CAMERA_INFO)
         name = self._named(role, infos) or _info_name(topic)
         if name in infos:
             return name
         if len(infos) == 1:
             self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
             return infos[0]
-        others = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME"
+        others = f"there are {', '.join(infos[: ros_bags.LISTED])}: name one with --topic info=NAME"
         raise ImportSourceError(
             f"no camera_info at {name}, without which the focal length of {topic.name} is not known; "
             f"{others if infos else 'the bag has no such topic'}"
@@ -220,10 +208,12 @@ class _BagReader:
     def _read_all(self) -> None:
         """One pass over the bag: times of images, calibrations, transforms and poses, by topic."""
         images = {topic.name for topic in (self._color, self._depth) if topic is not None}
-        infos, poses, transforms = (set(self._bag.topics(*kinds)) for kinds in ((CAMERA_INFO,), POSES, TF))
+        infos, poses, transforms = (
+            set(self._bag.topics(*kinds)) for kinds in ((ros_bags.CAMERA_INFO,), ros_bags.POSES, ros_bags.TF)
+        )
         stamps: dict[str, list[int]] = {name: [] for name in images}
         self._received: dict[str, list[int]] = {name: [] for name in images}
-        self._calibrations: dict[str, list[Calibration]] = {name: [] for name in infos}
+        self._calibrations: dict[str, list[ros_bags.Calibration]] = {name: [] for name in infos}
         self._poses = {name: PoseSeries() for name in poses}
         self._bodies: dict[str, str] = {}  # of topics of poses that tell whose they are
         self._tree = TransformTree()
@@ -232,7 +222,7 @@ class _BagReader:
                 stamps[name].append(stamp_of(message.header))
                 self._received[name].append(received_ns)
             elif name in infos:
-                found, known = Calibration(message), self._calibrations[name]
+                found, known = ros_bags.Calibration(message), self._calibrations[name]
                 if found.says_something or not known:
                     known[:] = [*(old for old in known if old.says_something), found]
             elif name in transforms:
@@ -246,7 +236,7 @@ class _BagReader:
             self.notices += fill_stamps(stamps[name], self._received[name], name)
         self._stamps = {name: np.array(values, np.int64) for name, values in stamps.items()}
 
-    def _intrinsics(self, topic: Topic, info: str) -> CameraIntrinsics:
+    def _intrinsics(self, topic: ros_bags.Topic, info: str) -> CameraIntrinsics:
         """Of the images of a topic."""
         unlike = {(c.model, c.size, *c.K, *c.D, *c.P): c for c in self._calibrations[info]}
         found = [c.intrinsics(f"camera_info of {topic.name}", rectified=topic.rectified) for c in unlike.values()]
@@ -288,7 +278,7 @@ class _BagReader:
                     f"true one: --topic info={info} or --topic info={other}"
                 )
 
-    def _link_depth(self, depth: Topic, info: str) -> tuple[CameraIntrinsics, Float64] | None:
+    def _link_depth(self, depth: ros_bags.Topic, info: str) -> tuple[CameraIntrinsics, Float64] | None:
         """Intrinsics of depth and ``T_color_depth``, by which it is registered; None = it is registered already."""
         if not info:
             self.notices.append(f"{depth.name} has no calibration: it is taken as registered to {self._color.name}")
@@ -348,7 +338,7 @@ class _BagReader:
 
     def _pose_topic(self) -> str:
         """The topic that poses come from; empty = tf."""
-        found = self._bag.topics(*POSES)
+        found = self._bag.topics(*ros_bags.POSES)
         name = self._named("pose", found)
         if name or self._options.world or set(WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
             return name
@@ -358,7 +348,7 @@ class _BagReader:
 
     def _track(self, topic: str) -> tuple[str, Track]:
         """Whose poses a topic tells, and the poses."""
-        body, frame = frame_name(self._options.body or self._bodies[topic]), self._frame
+        body, frame = ros_bags.frame_name(self._options.body or self._bodies[topic]), self._frame
         if not body:
             raise ImportSourceError(
                 f"{topic} does not say whose poses it tells; name the frame with --body, such as --body {frame} "
@@ -382,7 +372,7 @@ class _BagReader:
     def _world(self) -> str:
         """The frame of tf in which poses are."""
         way = self._tree.way_up(self._frame)
-        wanted = frame_name(self._options.world)
+        wanted = ros_bags.frame_name(self._options.world)
         frames = (wanted,) if wanted else WORLD_FRAMES
         world = next((world for world in frames if world in way), None)
         if world is not None:
@@ -399,7 +389,7 @@ class _BagReader:
         )
 
 
-def _without_doubles(topics: list[Topic]) -> list[Topic]:
+def _without_doubles(topics: list[ros_bags.Topic]) -> list[ros_bags.Topic]:
     """Of each camera one transport: raw images where there are some."""
     by_base = {t.base: t for t in sorted(topics, key=lambda t: t.raw)}
     return [t for t in topics if t in by_base.values()]
@@ -407,11 +397,11 @@ def _without_doubles(topics: list[Topic]) -> list[Topic]:
 
 def _several(role: str, topics: list[str], first: str) -> ImportSourceError:
     return ImportSourceError(
-        f"several topics fit the {role}: {', '.join(topics[:LISTED])}; name one: --topic {role}={first}"
+        f"several topics fit the {role}: {', '.join(topics[: ros_bags.LISTED])}; name one: --topic {role}={first}"
     )
 
 
-def _info_name(topic: Topic) -> str:
+def _info_name(topic: ros_bags.Topic) -> str:
     """Where the calibration of images is."""
     return f"{topic.base.rsplit('/', 1)[0]}/camera_info"
 

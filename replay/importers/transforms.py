@@ -24,16 +24,9 @@ import numpy as np
 from semantic_mapper.drivers.lens import is_fisheye_model
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, camera_of, first_size
 from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    convert_known,
-    inside,
-    keep_good,
-    read_plain_json,
-    refuse_keys,
-    unknown_notice,
-)
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics
 
@@ -108,21 +101,23 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     Raises ImportSourceError: the file is missing or of another form, or a lens that cannot be undone.
     """
     file = folder / FILE
-    plain = {key: value for key, value in read_plain_json(file).items() if value not in _OUR_AXES}
-    found = convert_known(plain, _Transforms, file)
-    refuse_keys(plain, _REFUSED, file)
-    notices = unknown_notice(file, [plain], _Transforms, _NEUTRAL) + unknown_notice(file, found.frames, _Frame)
+    plain = {key: value for key, value in tables.read_plain_json(file).items() if value not in _OUR_AXES}
+    found = tables.convert_known(plain, _Transforms, file)
+    tables.refuse_keys(plain, _REFUSED, file)
+    notices = tables.unknown_notice(file, [plain], _Transforms, _NEUTRAL) + tables.unknown_notice(
+        file, found.frames, _Frame
+    )
     shared = {name: value for name in _Lens.__struct_fields__ if (value := getattr(found, name)) is not None}
 
     def read_frame(numbered: tuple[int, dict[str, Any]]) -> tuple[_Frame, Path]:
         where = f"{file}, frame {numbered[0]}"
-        refuse_keys(numbered[1], _REFUSED, where)
+        tables.refuse_keys(numbered[1], _REFUSED, where)
         own = {key: value for key, value in numbered[1].items() if value is not None}
         of_all = {key: shared[key] for key in shared if key not in _FOCAL or not any(own.get(name) for name in _FOCAL)}
-        frame = convert_known(of_all | own, _Frame, where)
+        frame = tables.convert_known(of_all | own, _Frame, where)
         return frame, _image(folder, frame.file_path)
 
-    read = keep_good(read_frame, enumerate(found.frames), "frame", notices)
+    read = tables.keep_good(read_frame, enumerate(found.frames), "frame", notices)
     frames = [frame for frame, _ in read]
     size = (0.0, 0.0) if (found.w and found.h) or not read else first_size((image for _, image in read), folder)
     stamps_ns = _stamps([_time(frame) for frame in frames], file, notices)
@@ -135,9 +130,9 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
         T[:3, 3] *= factor
         lens = _intrinsics(frame, (frame.w or size[0], frame.h or size[1]), image)
         depth = frame.depth_file_path or frame.depth_path
-        return PosedPicture(image, lens, T @ GL_AXES, stamp_ns, inside(folder, depth) if depth else None)
+        return PosedPicture(image, lens, T @ GL_AXES, stamp_ns, tables.inside(folder, depth) if depth else None)
 
-    pictures = keep_good(picture_of, zip(read, stamps_ns, strict=True), "frame", notices)
+    pictures = tables.keep_good(picture_of, zip(read, stamps_ns, strict=True), "frame", notices)
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
     scale = _depth_scale(file, found, frames, options, factor)
     has_sensor = any(frame.depth_file_path for frame in frames) and not options.without_depth
@@ -171,7 +166,7 @@ def _depth_scale(
 
 
 def _image(folder: Path, name: str) -> Path:
-    named = inside(folder, name)
+    named = tables.inside(folder, name)
     return next((p for s in _SUFFIXES if (p := named.with_name(named.name + s)).is_file()), named)
 
 

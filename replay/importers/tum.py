@@ -23,18 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import interpolate_pose, pose_matrix
+from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import MATCH_NS, BadFrameError, DepthScale, ImportOptions
 from semantic_mapper.replay.importers.folder import read_intrinsics
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures
-from semantic_mapper.replay.importers.tables import (
-    MAX_NORM_ERROR,
-    inside,
-    keep_good,
-    left_out_notice,
-    read_lines,
-    seconds_to_ns,
-    split_row,
-)
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 DEPTH_SCALE = DepthScale(5000.0, convention="TUM's; another one belongs into intrinsics.json as depth_scale")
@@ -87,7 +79,7 @@ def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
         scale_from = ""
         notices.append("no depth.txt, or no image in it: frames come without depth")
     stamps_ns, poses, left_out = read_trajectory(folder / "groundtruth.txt")
-    notices += left_out_notice("pose", left_out)
+    notices += tables.left_out_notice("pose", left_out)
     color_ns, depth_ns = (np.array([stamp for stamp, _ in rows], np.int64) for rows in (color, depth))
     matches = match_nearest(color_ns, depth_ns, MATCH_NS)
     pictures: list[PosedPicture] = []
@@ -111,7 +103,7 @@ def open_icl(folder: Path, options: ImportOptions) -> PosedPictures:
     if len(truths) != 1:
         raise ImportSourceError(f"{folder}: has {len(truths)} files *.gt.freiburg; keep the one of these pictures")
     stamps_ns, rows, left_out = read_trajectory(truths[0])
-    notices += left_out_notice("pose", left_out)
+    notices += tables.left_out_notice("pose", left_out)
     poses = dict(zip((stamps_ns // 1_000_000_000).tolist(), rows, strict=True))
 
     def picture_of(numbered: tuple[int, str]) -> PosedPicture:
@@ -125,9 +117,11 @@ def open_icl(folder: Path, options: ImportOptions) -> PosedPictures:
         if row is not None:
             pose = _Z_UP @ pose_matrix(row[:3], row[3:]) @ _Y_DOWN
         stamp_ns = round(int(number) * 1e9 / _HZ)
-        return PosedPicture(inside(folder, color), _ICL, pose, stamp_ns, inside(folder, depth), seq=int(number))
+        return PosedPicture(
+            tables.inside(folder, color), _ICL, pose, stamp_ns, tables.inside(folder, depth), seq=int(number)
+        )
 
-    pictures = keep_good(picture_of, read_lines(listed), "line", notices)
+    pictures = tables.keep_good(picture_of, tables.read_lines(listed), "line", notices)
     return PosedPictures(f"icl {folder.resolve().name}", pictures, options, ICL_SCALE, notices, hz=_HZ)
 
 
@@ -151,17 +145,17 @@ def _read_list(file: Path, notices: list[str]) -> list[tuple[int, Path]]:
     """Stamps and files of a list, sorted by the stamps."""
     entries: dict[int, Path] = {}
     left_out: list[str] = []
-    for line, text in read_lines(file):
+    for line, text in tables.read_lines(file):
         words = re.split(r"[,;\s]+", text.strip(), maxsplit=1)
         try:
-            stamp_ns, picture = seconds_to_ns(words[0]), inside(file.parent, words[1].strip())
+            stamp_ns, picture = tables.seconds_to_ns(words[0]), tables.inside(file.parent, words[1].strip())
             if stamp_ns in entries:
                 raise ValueError("its stamp is there already")
         except (ValueError, IndexError, ImportSourceError) as error:
             left_out.append(f"{file}, line {line}: expected 'stamp file' ({error})")
             continue
         entries[stamp_ns] = picture
-    notices += left_out_notice("line", left_out)
+    notices += tables.left_out_notice("line", left_out)
     return sorted(entries.items())
 
 
@@ -173,13 +167,13 @@ def read_trajectory(file: Path) -> tuple[NDArray[np.int64], Float64, list[str]]:
     """
     found: dict[int, list[float]] = {}
     left_out: list[str] = []
-    for line, text in read_lines(file):
-        words = split_row(text)
+    for line, text in tables.read_lines(file):
+        words = tables.split_row(text)
         try:
-            stamp_ns, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
+            stamp_ns, row = tables.seconds_to_ns(words[0]), [float(word) for word in words[1:]]
             if len(row) != 7 or not np.isfinite(row).all():
                 raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
-            if abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
+            if abs(np.linalg.norm(row[3:]) - 1) > tables.MAX_NORM_ERROR:
                 raise ValueError(
                     f"its quaternion has length {np.linalg.norm(row[3:]):.3g}, not 1; the order is qx qy qz qw"
                 )

@@ -18,21 +18,13 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
-from semantic_mapper.fields.numbers import (
-    BACKBONE_DEVIATION,
-    BACKBONE_MEAN,
-    BACKBONE_STAGES,
-    COLOUR_DEVIATION,
-    COLOUR_MEAN,
-    NORM_EPSILON,
-    SURFACE_CHANNELS,
-)
+from semantic_mapper.fields import numbers
 from semantic_mapper.fields.surface_maps import has_depth, surface_maps
 from semantic_mapper.fields.views import sure_depth
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3
-BACKBONE_WIDTHS = tuple(stage[-1][1] for stage in BACKBONE_STAGES)  # channels at strides 2, 4, 8, 16, 32
+BACKBONE_WIDTHS = tuple(stage[-1][1] for stage in numbers.BACKBONE_STAGES)  # channels at strides 2, 4, 8, 16, 32
 BACKBONE_STEM = 32
 
 
@@ -75,7 +67,7 @@ class UpBlock(nn.Module):
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(channels, eps=NORM_EPSILON)
+    return nn.BatchNorm2d(channels, eps=numbers.NORM_EPSILON)
 
 
 class StridedConvolution(nn.Conv2d):
@@ -123,17 +115,17 @@ class EfficientNetLite0(nn.Module):
     """Colours in [0, 1] (B, 3, H, W) -> features at strides 2, 4, ... of ``BACKBONE_WIDTHS`` channels.
     ``stages``: how many of the five; the classifier of the published network and its last block are not built."""
 
-    def __init__(self, stages: int = len(BACKBONE_STAGES)) -> None:
+    def __init__(self, stages: int = len(numbers.BACKBONE_STAGES)) -> None:
         super().__init__()
         self.stem = StridedConvolution(3, BACKBONE_STEM, 3, 1)
         self.stem_norm = _norm(BACKBONE_STEM)
         self.stages = nn.ModuleList(
-            nn.Sequential(*(InvertedResidual(*block) for block in stage)) for stage in BACKBONE_STAGES[:stages]
+            nn.Sequential(*(InvertedResidual(*block) for block in stage)) for stage in numbers.BACKBONE_STAGES[:stages]
         )
 
     def forward(self, rgb: torch.Tensor) -> list[torch.Tensor]:
         """One feature map a stage, the finest first."""
-        x = functional.relu6(self.stem_norm(self.stem((rgb - BACKBONE_MEAN) / BACKBONE_DEVIATION)))
+        x = functional.relu6(self.stem_norm(self.stem((rgb - numbers.BACKBONE_MEAN) / numbers.BACKBONE_DEVIATION)))
         maps: list[torch.Tensor] = []
         for stage in self.stages:
             x = stage(x)
@@ -177,7 +169,7 @@ class UNet(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         skips: list[torch.Tensor] = []
         if self.backbone is not None and self.laterals is not None:
-            maps = self.backbone(x[:, :COLOURS] * COLOUR_DEVIATION + COLOUR_MEAN)
+            maps = self.backbone(x[:, :COLOURS] * numbers.COLOUR_DEVIATION + numbers.COLOUR_MEAN)
             skips = [lateral(features) for lateral, features in zip(self.laterals, maps, strict=True)]
         x = functional.relu(self.stem(x))
         for i, stage in enumerate(self.stages):
@@ -204,7 +196,7 @@ class ImageEncoder(nn.Module):
     def __init__(self, config: EncoderConfig, feature_dim: int) -> None:
         super().__init__()
         self.colour_net = UNet(COLOURS, config, feature_dim)
-        self.depth_net = UNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
+        self.depth_net = UNet(COLOURS + numbers.SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self.takes_computed_depth = config.depth and config.computed_depth
         self._of_batch = False
         self._frozen: tuple[nn.Module, ...] = ()
@@ -214,7 +206,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, views: SourceViews) -> torch.Tensor:
         """Features (m, C, H / 2, W / 2) of m views; H and W need not be multiples of the deepest stride."""
-        rgb = (views.rgb - COLOUR_MEAN) / COLOUR_DEVIATION
+        rgb = (views.rgb - numbers.COLOUR_MEAN) / numbers.COLOUR_DEVIATION
         if self.depth_net is None:
             return self.colour_net(rgb)
         views = sure_depth(views, computed=self.takes_computed_depth)

@@ -15,23 +15,7 @@ from numpy.typing import NDArray
 from openvino import opset13 as ops
 
 from semantic_mapper.config import SRayConfig
-from semantic_mapper.fields.numbers import (
-    BACKBONE_DEVIATION,
-    BACKBONE_MEAN,
-    BACKBONE_STAGES,
-    COLOUR_DEVIATION,
-    COLOUR_MEAN,
-    COMMON_FOCAL,
-    FAR_M,
-    GEOMETRY_CHANNELS,
-    MEASURED_SCALE,
-    MEASURED_SHIFT,
-    NEAR_M,
-    NORM_EPSILON,
-    PREDICTED_SCALE,
-    SURFACE_CHANNELS,
-    TORCH_NORM_EPSILON,
-)
+from semantic_mapper.fields import numbers
 from semantic_mapper.geometry import expect_shape
 from semantic_mapper.kernels.binding import thread_count
 from semantic_mapper.types import Float32, UInt8
@@ -104,11 +88,11 @@ class _Builder:
         focal = ops.parameter([1], np.float32, "focal")
         inputs = [rgb, depth, spread, focal]
         colours = ops.transpose(ops.convert(rgb, np.float32), [0, 3, 1, 2])
-        seen = (colours - _f(255 * COLOUR_MEAN)) * _f(1 / (255 * COLOUR_DEVIATION))
+        seen = (colours - _f(255 * numbers.COLOUR_MEAN)) * _f(1 / (255 * numbers.COLOUR_DEVIATION))
         if with_depth:
-            inputs.append(maps := ops.parameter([1, SURFACE_CHANNELS, height, width], np.float32, "maps"))
+            inputs.append(maps := ops.parameter([1, numbers.SURFACE_CHANNELS, height, width], np.float32, "maps"))
             seen = ops.concat([seen, maps], 1)
-        photo = (colours * _f(1 / 255) - _f(BACKBONE_MEAN)) * _f(1 / BACKBONE_DEVIATION)
+        photo = (colours * _f(1 / 255) - _f(numbers.BACKBONE_MEAN)) * _f(1 / numbers.BACKBONE_DEVIATION)
         net = "encoder.depth_net" if with_depth else "encoder.colour_net"
         feature, picture = self._unet(net, seen, photo, size)
         geometry = self._geometry(feature, depth, spread, focal)
@@ -144,10 +128,10 @@ class _Builder:
 
     def _backbone(self, name: str, photo: Node, size: tuple[int, int], stages: int) -> list[Node]:
         """Feature maps at strides 2, 4, ..., the finest first; see ``EfficientNetLite0``."""
-        x, size = self._strided(f"{name}.stem", photo, size, BACKBONE_STAGES[0][0][0], 3)
+        x, size = self._strided(f"{name}.stem", photo, size, numbers.BACKBONE_STAGES[0][0][0], 3)
         x = ops.clamp(x, 0.0, 6.0)
         maps: list[Node] = []
-        for i, stage in enumerate(BACKBONE_STAGES[:stages]):
+        for i, stage in enumerate(numbers.BACKBONE_STAGES[:stages]):
             for k, (c_in, c_out, kernel, stride, expansion) in enumerate(stage):
                 block, y, inner = f"{name}.stages.{i}.{k}", x, c_in * expansion
                 if expansion > 1:
@@ -164,22 +148,24 @@ class _Builder:
     def _geometry(self, feature: Node, depth: Node, spread: Node, focal: Node) -> Node:
         """The mixture (1, 5, h, w); see ``GeometryInit``."""
         measured = ops.greater(depth, _f(0))
-        near = ops.maximum(depth, _f(NEAR_M))
+        near = ops.maximum(depth, _f(numbers.NEAR_M))
         inverse = ops.select(measured, _f(1) / near, _f(0))
         x = ops.concat([feature, inverse, ops.convert(measured, np.float32)], 1)
         x = ops.relu(self._conv("geometry_init.net.0", x, 16, 3))
-        raw = self._conv("geometry_init.net.2", x, GEOMETRY_CHANNELS + 1, 3)
+        raw = self._conv("geometry_init.net.2", x, numbers.GEOMETRY_CHANNELS + 1, 3)
         shift, widen, behind, widen_behind, fraction, guess = (
-            ops.slice(raw, [i], [i + 1], [1], [1]) for i in range(GEOMETRY_CHANNELS + 1)
+            ops.slice(raw, [i], [i + 1], [1], [1]) for i in range(numbers.GEOMETRY_CHANNELS + 1)
         )
-        predicted = _f(1) / (_f(1 / FAR_M) + _f(1 / NEAR_M - 1 / FAR_M) * ops.sigmoid(guess - _f(2.0)))
+        predicted = _f(1) / (
+            _f(1 / numbers.FAR_M) + _f(1 / numbers.NEAR_M - 1 / numbers.FAR_M) * ops.sigmoid(guess - _f(2.0))
+        )
         if self._config.tokens == "surface":
-            predicted = predicted * (focal * _f(1 / COMMON_FOCAL))
-        mu_1 = ops.select(measured, depth * (_f(1) + _f(MEASURED_SHIFT) * ops.tanh(shift)), predicted)
-        start = ops.maximum(ops.select(measured, _f(MEASURED_SCALE), _f(PREDICTED_SCALE)), spread)
+            predicted = predicted * (focal * _f(1 / numbers.COMMON_FOCAL))
+        mu_1 = ops.select(measured, depth * (_f(1) + _f(numbers.MEASURED_SHIFT) * ops.tanh(shift)), predicted)
+        start = ops.maximum(ops.select(measured, _f(numbers.MEASURED_SCALE), _f(numbers.PREDICTED_SCALE)), spread)
         s_1 = mu_1 * start * ops.exp(ops.clamp(widen, -3.0, 3.0))
         mu_2 = mu_1 * (_f(1.02) + ops.softplus(behind))
-        s_2 = mu_2 * _f(PREDICTED_SCALE) * ops.exp(ops.clamp(widen_behind, -3.0, 3.0))
+        s_2 = mu_2 * _f(numbers.PREDICTED_SCALE) * ops.exp(ops.clamp(widen_behind, -3.0, 3.0))
         return ops.concat([mu_1, s_1, mu_2, s_2, ops.sigmoid(fraction + _f(3.0))], 1)
 
     def _residual(self, name: str, x: Node, out: int, stride: int) -> Node:
@@ -214,7 +200,7 @@ class _Builder:
         self, name: str, x: Node, out: int, kernel: int, *, norm: str = "", groups: int = 1, **options: Any
     ) -> Node:
         """A convolution with the batch norm after it folded in."""
-        epsilon = TORCH_NORM_EPSILON if norm else NORM_EPSILON  # of residual blocks; of the backbone
+        epsilon = numbers.TORCH_NORM_EPSILON if norm else numbers.NORM_EPSILON  # of residual blocks; of the backbone
         norm = norm or f"{name}_norm"
         gamma, beta, mean, var = (
             self._tensor(f"{norm}.{n}", out).astype(np.float64)

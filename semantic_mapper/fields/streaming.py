@@ -12,23 +12,9 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import ShapeError, WeightsError
+from semantic_mapper.fields import numbers
 from semantic_mapper.fields.base import CHUNK, MAX_SOURCE_VIEWS, EncodedSize, Rays, Rendered, WorkingView
 from semantic_mapper.fields.inference import ImageNetwork, check_networks
-from semantic_mapper.fields.numbers import (
-    BACKGROUND_M,
-    COLOUR_SCALE,
-    CUES,
-    GEOMETRY_CHANNELS,
-    HIDDEN,
-    LABEL_UNCERTAINTY,
-    LEAST_VISIBILITY,
-    MIN_DEPTH_M,
-    OWN_DENSITY_OFFSET,
-    OWN_RADIUS_M,
-    SURFACE_CUES,
-    TAU,
-    UNSURE_SPREAD,
-)
 from semantic_mapper.fields.sampling import guided_samples
 from semantic_mapper.fields.surface_maps import has_depth, surface_maps
 from semantic_mapper.fields.weights import Tensors
@@ -98,7 +84,7 @@ class StreamingSRay:
         self._tensors = tensors
         self._networks: dict[tuple[int, int, bool], ImageNetwork] = like._networks if like else {}
         at_surface = config.tokens == "surface"
-        self._settings = _Settings(config.heads, at_surface, COLOUR_SCALE if at_surface else 0.0)
+        self._settings = _Settings(config.heads, at_surface, numbers.COLOUR_SCALE if at_surface else 0.0)
         self._own_factors = tensors["own_view_factor"] if at_surface else np.ones(2, np.float32)
 
     def encode(self, view: WorkingView) -> StreamedViews:
@@ -110,7 +96,7 @@ class StreamingSRay:
         depth, spread = view.depth_m, np.zeros_like(view.depth_m)
         if view.depth_sigma_m is not None:
             # What was computed and is not sure becomes a hole; all of it, for weights that have not learned from such.
-            sure = view.depth_sigma_m <= (UNSURE_SPREAD if self.config.encoder.computed_depth else 0) * depth
+            sure = view.depth_sigma_m <= (numbers.UNSURE_SPREAD if self.config.encoder.computed_depth else 0) * depth
             depth = depth * sure
             spread = (view.depth_sigma_m * sure / np.maximum(depth, np.float32(1e-3))).astype(np.float32, copy=False)
         K = camera_matrix(view.intrinsics).astype(np.float32)
@@ -217,14 +203,14 @@ class _Settings(NamedTuple):
     at_surface: bool  # one token a view for the attention across views and for blending
     colour_scale: float  # of the colours whose moments the density depends on; 0 = on none
     sample_weight_threshold: float = 0.0  # samples of a smaller fraction of their ray's weight are not attended to
-    log_ratio: float = math.log(1 / TAU)  # of Eq. 12
-    hidden_below: float = HIDDEN
-    least_visibility: float = LEAST_VISIBILITY
-    label_uncertainty: float = LABEL_UNCERTAINTY
-    own_density_offset: float = OWN_DENSITY_OFFSET
-    min_depth_m: float = MIN_DEPTH_M
-    background_m: float = BACKGROUND_M
-    own_radius_m: float = OWN_RADIUS_M
+    log_ratio: float = math.log(1 / numbers.TAU)  # of Eq. 12
+    hidden_below: float = numbers.HIDDEN
+    least_visibility: float = numbers.LEAST_VISIBILITY
+    label_uncertainty: float = numbers.LABEL_UNCERTAINTY
+    own_density_offset: float = numbers.OWN_DENSITY_OFFSET
+    min_depth_m: float = numbers.MIN_DEPTH_M
+    background_m: float = numbers.BACKGROUND_M
+    own_radius_m: float = numbers.OWN_RADIUS_M
 
 
 class _Layer(NamedTuple):
@@ -271,7 +257,7 @@ def _check_views(sources: StreamedViews, channels: int) -> None:
     sizes = expect_shape(sources.feature, f"M h w {channels}", "source features")
     count, size = sizes["M"], f"{sizes['M']} {sizes['h']} {sizes['w']}"
     expect_shape(sources.rgb, f"{size} 3", "source rgb")
-    expect_shape(sources.geometry, f"{size} {GEOMETRY_CHANNELS}", "source geometry")
+    expect_shape(sources.geometry, f"{size} {numbers.GEOMETRY_CHANNELS}", "source geometry")
     expect_shape(sources.log_scale, size, "source log_scale")
     expect_shape(sources.K, f"{count} 4", "source K")
     expect_shape(sources.T_camera_world, f"{count} 3 4", "source T_camera_world")
@@ -303,7 +289,7 @@ def _aligned(rows: int, columns: int) -> Float32:
 def _pack_weights(tensors: Tensors, config: SRayConfig, classes: int) -> _Weights:
     """Raises KeyError: a tensor is missing; its name. ShapeError: one is of another shape."""
     dim, values = config.feature_dim, config.feature_dim + (3 if config.tokens == "surface" else 0)
-    cues = SURFACE_CUES if config.tokens == "surface" else CUES
+    cues = numbers.SURFACE_CUES if config.tokens == "surface" else numbers.CUES
 
     def matrix(name: str, out: int, size: int) -> Float32:
         expect_shape(tensors[name], f"{out} {size}", f"'{name}'")

@@ -16,15 +16,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.blocks import BLOCK_VOXELS, BlockIndex
 from semantic_mapper.mapping.floor_plan import Band, OccupancyGrid, find_up, occupancy_grid
 from semantic_mapper.mapping.map_types import MapPoints, require_metres
-from semantic_mapper.queries.checks import (
-    as_numbers,
-    check_box,
-    check_directions,
-    check_points,
-    check_positive,
-    check_up,
-    rows_in_box,
-)
+from semantic_mapper.queries import checks
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float32, Float64, Int32, Int64, UInt8
 
@@ -67,8 +59,8 @@ def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
     """Surface points in a box with corners (3,), world metres, one a voxel, in a fixed order; ``MapError``: a bad
     box."""
-    low, high = check_box(lower, upper, snapshot)
-    surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
+    low, high = checks.check_box(lower, upper, snapshot)
+    surface = surface_voxels(snapshot, checks.rows_in_box(snapshot, low, high))
     inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
     return surface_points(snapshot, SurfaceVoxels(surface.row[inside], surface.voxel[inside], surface.point[inside]))
 
@@ -97,7 +89,7 @@ def costmap(
     (3,) in the world, and ``floor_m``, the floor's height along it, are found by default. ``MapError``: a bad number;
     no metres; no floor, or nothing near it."""
     require_metres(snapshot.scale_known, "costmap")
-    axis = up_in(snapshot) if up is None else check_up(up)
+    axis = up_in(snapshot) if up is None else checks.check_up(up)
     points = surface_points(snapshot, surface_voxels(snapshot))
     return occupancy_grid(points, axis, snapshot.voxel_size_m, height_m, floor_m).inflated(radius_m)
 
@@ -126,9 +118,9 @@ def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, 
     """The first surface that each ray meets from its front, at most ``max_m`` away (up to 100). ``origins`` (world
     metres) and ``directions`` (of any length) are (N, 3) or (3,), which stands for all. ``MapError``: bad arguments, or
     shapes that do not go together."""
-    check_positive(max_m, "max_m", MAX_RANGE_M)
-    origin = check_points(np.atleast_2d(as_numbers(origins, "origins")), snapshot, "origins")
-    direction = check_directions(directions, "directions")
+    checks.check_positive(max_m, "max_m", MAX_RANGE_M)
+    origin = checks.check_points(np.atleast_2d(checks.as_numbers(origins, "origins")), snapshot, "origins")
+    direction = checks.check_directions(directions, "directions")
     if len(origin) != len(direction) and 1 not in (len(origin), len(direction)):
         raise MapError(f"cast_rays: {len(origin)} origins and {len(direction)} directions do not go together")
     count = max(len(origin), len(direction)) if len(origin) and len(direction) else 0

@@ -17,6 +17,7 @@ from torch import nn
 from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.learned import build_field
+from semantic_mapper.fields.scene import march
 from semantic_mapper.fields.scene.grid import (
     HAZE,
     NOTHING,
@@ -27,18 +28,6 @@ from semantic_mapper.fields.scene.grid import (
     at_resolution,
     ray_fraction,
     sky_texels,
-)
-from semantic_mapper.fields.scene.march import (
-    BIAS,
-    LossWeights,
-    RayResults,
-    SampleLists,
-    TargetArrays,
-    adam_grid,
-    add_total_variation,
-    fuse_grid_depth,
-    photometric_rays,
-    scatter_grid,
 )
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.training.config import FinetuneConfig
@@ -126,12 +115,12 @@ def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> 
         depth = rays.depth_m[rays.pixels_of(i)].reshape(rays.image_size(i))
         T_camera_grid = invert_pose(rays.T_world_camera[i].astype(np.float64)) @ T_world_grid
         arrays = (distance, weight, depth, np.ascontiguousarray(T_camera_grid[:3]))
-        fuse_grid_depth(len(distance), *arrays, k.fx, k.fy, k.cx, k.cy, TRUNCATION * config.voxel_m)
+        march.fuse_grid_depth(len(distance), *arrays, k.fx, k.fy, k.cx, k.cy, TRUNCATION * config.voxel_m)
     distance *= np.float32(TRUNCATION)
     grid = SceneGrid(config)
     density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
     per_voxel = density / BETA
-    raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
+    raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - march.BIAS
     values = np.where(weight > 0, np.maximum(raw, NOTHING), unseen).astype(np.float32)
     with torch.no_grad():
         grid.values[..., 0] = torch.from_numpy(values)
@@ -186,7 +175,7 @@ class _Fitter:
         self.log_gain = np.zeros((len(rays.intrinsics), 3))
         measured = bool((rays.depth_m > 0).any())
         opacity = self.config.opacity
-        self.loss = LossWeights(opacity=(OPACITY if measured else 0.0) if opacity is None else opacity)
+        self.loss = march.LossWeights(opacity=(OPACITY if measured else 0.0) if opacity is None else opacity)
         # A start from depth has nothing to gain from coarse grids.
         self.stages = COARSE[-1:] if measured else COARSE
         self.stage, self.steps = 0, 0
@@ -202,7 +191,7 @@ class _Fitter:
         """Buffers for the grid as it is now."""
         self.adam = GridAdam(self.grid, self.rays, self.config.near_m)
         self.gradient = np.zeros_like(self.adam.values)
-        self.samples = SampleLists.empty(self.config.rays, self.gradient.shape, 4)
+        self.samples = march.SampleLists.empty(self.config.rays, self.gradient.shape, 4)
 
     def learn(self, fraction: float) -> float:
         """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
@@ -217,7 +206,7 @@ class _Fitter:
         loss = self._rays_backward(self._draw())
         rate, count = LEARNING_RATE * FINAL_FRACTION**fraction, self.config.rays
         variation = (DENSITY_VARIATION / count, COLOUR_VARIATION / count)
-        add_total_variation(len(self.gradient), self.adam.values, self.gradient, *variation)
+        march.add_total_variation(len(self.gradient), self.adam.values, self.gradient, *variation)
         self.adam.step(self.gradient, rate, rate)
         return loss
 
@@ -243,11 +232,11 @@ class _Fitter:
         depth = self.rays.depth_m[pixels]
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
-        results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
+        results = march.RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
         rays = self.grid.ray_arrays(batch, jitter)
-        targets = TargetArrays(colour, inverse, gain, behind)
-        photometric_rays(len(pixels), self.grid.arrays(), rays, targets, self.loss, self.samples, results)
-        scatter_grid(len(self.gradient), self.samples, self.gradient)
+        targets = march.TargetArrays(colour, inverse, gain, behind)
+        march.photometric_rays(len(pixels), self.grid.arrays(), rays, targets, self.loss, self.samples, results)
+        march.scatter_grid(len(self.gradient), self.samples, self.gradient)
         self._step_sky(batch.direction, results.sky_gradient)
         if self.config.exposure:
             gradient = _sums(frame, results.gain_gradient * gain, len(self.log_gain))
@@ -277,7 +266,7 @@ class GridAdam:
         self._count += 1
         buffers = (self.values, gradient, self._first, self._second, self.seen)
         corrections = (1 - BETA1**self._count, 1 - BETA2**self._count)
-        adam_grid(len(self.values), *buffers, density_rate, colour_rate, BETA1, BETA2, *corrections)
+        march.adam_grid(len(self.values), *buffers, density_rate, colour_rate, BETA1, BETA2, *corrections)
 
 
 class _Adam:

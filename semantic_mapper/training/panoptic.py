@@ -19,16 +19,9 @@ from semantic_mapper.fields.scene.primitives import Primitive
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.training import grid_fit
 from semantic_mapper.training.config import FinetuneConfig, PanopticFitConfig
 from semantic_mapper.training.fit import Budget, FitTask, Fitted, descend, fit
-from semantic_mapper.training.grid_fit import (
-    GridAdam,
-    fit_geometry,
-    grid_figures,
-    grid_of_depth,
-    surface_depth,
-    trunk_optimiser,
-)
 from semantic_mapper.training.views import FrameRays, frame_rays, pixel_channels
 from semantic_mapper.types import Bool, Float32, Float64, Int64, PosedFrame
 
@@ -94,7 +87,7 @@ def fit_panoptic(task: FitTask) -> Fitted:
         return shown_boxes(start.moving, seen, rays)[0]
 
     shape = msgspec.structs.replace(start.shape, boxes=boxes)
-    field, grid = fit_geometry(task._replace(frames=frames), shape, Panoptic.kind, GRID_UNTIL, shows_movers)
+    field, grid = grid_fit.fit_geometry(task._replace(frames=frames), shape, Panoptic.kind, GRID_UNTIL, shows_movers)
     assert isinstance(field, Panoptic)
     data = pseudo_rays(grid.frames, label_set, config.width)
     still = np.flatnonzero(~shows_movers(grid.frames, data.rays))
@@ -109,7 +102,7 @@ def fit_panoptic(task: FitTask) -> Fitted:
         "labelled_frames": sum(f.label is not None for f in frames),
         "frames": len(frames),
     }
-    figures = grid_figures(grid) | {"grid_steps": grid.steps, "steps": steps, "panoptic": found}
+    figures = grid_fit.grid_figures(grid) | {"grid_steps": grid.steps, "steps": steps, "panoptic": found}
     return Fitted(field, figures, [f for f in frames if f.label is not None and not f.label_is_pseudo])
 
 
@@ -212,10 +205,10 @@ class JointFit:
         self.rng = np.random.default_rng(config.seed)
         self.group = merged_classes(field.label_set, field.shape.merge)
         assert field.trunk is not None
-        self.optimiser = trunk_optimiser(field.trunk, field.head, field.classifier)
+        self.optimiser = grid_fit.trunk_optimiser(field.trunk, field.head, field.classifier)
         self.rates = [group["lr"] for group in self.optimiser.param_groups]
         field.grid.values.requires_grad_(True)
-        self.adam = GridAdam(field.grid, data.rays, config.grid.near_m)
+        self.adam = grid_fit.GridAdam(field.grid, data.rays, config.grid.near_m)
         self.solid = field.solid() if field.shape.uncovered == "empty" else None
         self.step = 0
         self._empty_cells()
@@ -343,7 +336,7 @@ def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, g
     for number, frame in enumerate(frames):
         for met, pixels in _met(boxes, frame, rays, number):
             depth = rays.depth_m[pixels].copy()
-            surface = surface_depth(field, rays, pixels, near_m).numpy()
+            surface = grid_fit.surface_depth(field, rays, pixels, near_m).numpy()
             depth[(depth > 0) & (surface > 0) & (depth > (1 - ELSEWHERE) * surface)] = FAR_M
             depths[met.number][pixels] = depth
             measured[met.number] += int(met.found.inside(torch.from_numpy(depth)[:, None]).any(-1).sum())
@@ -359,7 +352,7 @@ def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, g
         if measured[box] < LEAST_PIXELS:
             _fill_core(grid)
             continue
-        filled = grid_of_depth(own, grid.config, NOTHING)
+        filled = grid_fit.grid_of_depth(own, grid.config, NOTHING)
         grid.load_state_dict(filled.state_dict())
         _paint(grid, own, gains)
 
