@@ -3,8 +3,6 @@
 Text is shown as it is: nothing in it is markup, and what would steer the terminal is made visible (``PlainConsole``).
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -65,7 +63,7 @@ class Output:
         self._stream = stream
 
     @classmethod
-    def guarded(cls) -> Output:
+    def guarded(cls) -> "Output":
         """Keep the real stdout for results; from now on anything else that is written to it lands on stderr."""
         sys.stdout.flush()
         stream = os.fdopen(os.dup(1), "w", encoding="utf-8")

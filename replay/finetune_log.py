@@ -4,8 +4,6 @@ Kinds of fields that are fitted to one scene take the other frames, too; "panopt
 of a folder, of weights, or the log's own images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -302,7 +300,7 @@ class FrameSource:
         numbers = _evenly(range(len(self.log)), MAX_SCENE_FRAMES)
         return [frame for _, frame in self._each(numbers, read, "reading frames")]
 
-    def pseudo_labelled(self, labels: PseudoLabels) -> list[PosedFrame]:
+    def pseudo_labelled(self, labels: "PseudoLabels") -> list[PosedFrame]:
         """Frames at working width with their pseudo labels, at most ``MAX_SCENE_FRAMES``; see ``choose_frames``.
 
         A frame whose label image is missing or cannot be used gives its colours alone; these are counted.

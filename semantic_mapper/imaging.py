@@ -1,7 +1,5 @@
 """Frames at a working size (colours by area, depth by nearest pixel, holes filled on request), and turned upright."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -64,7 +62,7 @@ class FrameViews:
         self._rgb: dict[tuple[int, int], UInt8] = {} if rgb is None else rgb
         self._depth: dict[tuple[int, int], Float32] = {}
 
-    def with_depth(self, depth_m: Float32) -> FrameViews:
+    def with_depth(self, depth_m: Float32) -> "FrameViews":
         """The same frame with other depth (H, W); its colours are not resized again."""
         return FrameViews(replace(self.frame, depth_m=depth_m), self._rgb)
 

@@ -4,8 +4,6 @@ Images and maps hold *ids* (uint8, the numbers of the data set, ``ignore_id`` = 
 hold *channels*: the position of an id in ``LabelSet.ids``. Only this module converts between the two.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -89,7 +87,7 @@ class LabelSet:
         """Ids of the classes that come in countable pieces: all but those named in ``stuff`` (see ``STUFF_NAMES``)."""
         return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name not in stuff)
 
-    def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
+    def renamed(self, names: Mapping[str, str]) -> "tuple[LabelSet, UInt8]":
         """Give classes other names, by the present ones; those that then have one name become one, of the lowest id.
 
         Raises LabelError: a present name that is not in the set.
@@ -108,7 +106,7 @@ class LabelSet:
         ids, colors = zip(*first.values(), strict=True)
         return LabelSet(self.name, ids, tuple(first), colors, self.ignore_id), table
 
-    def with_names(self, names: Sequence[str]) -> LabelSet:
+    def with_names(self, names: Sequence[str]) -> "LabelSet":
         """This set and classes of more names, in their order, with the lowest ids that are free.
 
         Raises LabelError: there are no more ids, or a name is there already.
@@ -119,7 +117,7 @@ class LabelSet:
         colors = self.colors + tuple(_distinct_color(i) for i in free)
         return LabelSet(self.name, (*self.ids, *free), (*self.names, *names), colors, self.ignore_id)
 
-    def channel_map_from(self, other: LabelSet) -> NDArray[np.int64]:
+    def channel_map_from(self, other: "LabelSet") -> NDArray[np.int64]:
         """For each id 0..255 of ``other``: this set's channel of the class with the same name, else -1."""
         mine = {name: channel for channel, name in enumerate(self.names)}
         table = np.full(256, IGNORE_CHANNEL, np.int64)

@@ -5,8 +5,6 @@ found, and a sliding bundle keeps points and keyframes in agreement. A picture t
 one looks like a keyframe again.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -136,7 +134,7 @@ class VisualPoseSource(PoseSource):
         self._last = pose
         return PoseEstimate(pose, "visual", _DRIFT * self._way)
 
-    def _scaled(self, odometry: VisualOdometry, pose: Float64, reference: Float64 | None) -> Float64:
+    def _scaled(self, odometry: "VisualOdometry", pose: Float64, reference: Float64 | None) -> Float64:
         """The pose once what is known of the scale, and of where the world begins, is brought into the map."""
         if self._config.camera_height_m:
             return self._over_floor(odometry, pose)
@@ -155,7 +153,7 @@ class VisualPoseSource(PoseSource):
         self._metric = True
         return after
 
-    def _over_floor(self, odometry: VisualOdometry, pose: Float64) -> Float64:
+    def _over_floor(self, odometry: "VisualOdometry", pose: Float64) -> Float64:
         """The pose once the distance from the floor is brought to what the camera's height over it is."""
         if not odometry.keyframe_added:
             return pose
@@ -172,7 +170,7 @@ class VisualPoseSource(PoseSource):
         odometry.rescale(factor**_GAIN, pose, pose, everything=False)
         return pose
 
-    def _begin_world(self, odometry: VisualOdometry, pose: Float64, factor: float, start: Float64) -> Float64:
+    def _begin_world(self, odometry: "VisualOdometry", pose: Float64, factor: float, start: Float64) -> Float64:
         """The map's first view, at the identity until now, is put to where the world begins."""
         odometry.rescale(factor, np.eye(4), start, everything=True)
         self._world_begun = True

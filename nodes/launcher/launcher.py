@@ -1,7 +1,5 @@
 """Starts the nodes of a launch, watches over them, ends them in order, and publishes how each of them is."""
 
-from __future__ import annotations
-
 import os
 import socket
 import time
@@ -49,7 +47,7 @@ class Notifier:
         self._failed = False
 
     @classmethod
-    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Notifier":
         """As systemd has set it up; a watchdog may be meant for another process."""
         usec, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
         ours = usec.isdigit() and pid in ("", str(os.getpid()))

@@ -1,7 +1,5 @@
 """What a launch says of itself: its note, and how its nodes are; ``transport.launches`` finds those that run."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -86,7 +84,7 @@ class LaunchView:
                 self.add(message)
 
     @classmethod
-    def whole(cls, subscriber: NewestSubscriber) -> LaunchView:
+    def whole(cls, subscriber: NewestSubscriber) -> "LaunchView":
         """A view of all nodes, as soon as they have been seen for long enough to have rates. Raises TransportError: the
         launcher says nothing."""
         view, deadline = cls(), time.monotonic() + ANSWER_S

@@ -1,7 +1,5 @@
 """The recorder node: writes what other nodes publish to a log, and loses nothing that the disk has room for."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections import deque
@@ -57,7 +55,7 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> str:
     return "; ".join(filter(None, (recorder.losses, recorder.never_came)))
 
 
-def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Recorder], bool]) -> Recorder:
+def record(context: NodeContext, options: RecorderOptions, follow: "Callable[[Recorder], bool]") -> "Recorder":
     """Record until the stream ends or somebody asks to stop, or ``follow``, called some twenty times a second, says
     True.
 

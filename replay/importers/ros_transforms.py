@@ -3,8 +3,6 @@
 ``T_parent_child`` of each frame is fixed, or changes over time and is interpolated between its two neighbours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import chain, combinations_with_replacement, pairwise
 from typing import Any
@@ -56,7 +54,7 @@ class Track:
             return pose_matrix(self._rows[-1, :3], self._rows[-1, 3:])
         return pose_at(stamp_ns, self.stamps_ns, self._rows, MAX_GAP_NS, within_ns)
 
-    def differs(self, other: Track, *, unless_apart: bool) -> bool:
+    def differs(self, other: "Track", *, unless_apart: bool) -> bool:
         """Whether another source tells the same poses otherwise.
 
         ``unless_apart``: one after the other is no contradiction, since a program was started again.

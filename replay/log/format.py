@@ -6,8 +6,6 @@ that does not fit: the file ends with the one before. What the stream is (camera
 attachment, and as the first message.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -186,7 +184,7 @@ class LogWriter:
         finally:
             os.close(self._file.fd)
 
-    def __enter__(self) -> LogWriter:
+    def __enter__(self) -> "LogWriter":
         return self
 
     def __exit__(self, *exception: object) -> None:

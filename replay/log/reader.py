@@ -1,7 +1,5 @@
 """Reading a log: what is damaged is reported and passed over, the rest is given."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -161,7 +159,7 @@ class LogReader:
         """Close the files. Harmless when repeated."""
         self._stack.close()
 
-    def __enter__(self) -> LogReader:
+    def __enter__(self) -> "LogReader":
         return self
 
     def __exit__(self, *exception: object) -> None:

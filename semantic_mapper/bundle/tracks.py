@@ -1,7 +1,5 @@
 """Corners that are followed from image to image (Lucas-Kanade), each with a number of its own."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -33,7 +31,7 @@ class Tracks:
         """Rows (M,) of tracks that are there."""
         return np.searchsorted(self.ids, ids).astype(np.int64)
 
-    def without(self, ids: Int64) -> Tracks:
+    def without(self, ids: Int64) -> "Tracks":
         """All but these."""
         keep = ~np.isin(self.ids, ids)
         return Tracks(self.ids[keep], self.pixels[keep])
@@ -90,7 +88,7 @@ class Tracker:
         self._before, self._last = self._last, image
         return self.tracks
 
-    def fresh(self) -> Tracker:
+    def fresh(self) -> "Tracker":
         """One that follows nothing yet, and gives numbers that this one has not given."""
         other = Tracker(self._count)
         other._next_id = self._next_id

@@ -11,8 +11,6 @@ One implementation for everything the project reports. Rules, the same everywher
   another number and are always named so.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
@@ -66,7 +64,7 @@ class ConfusionMatrix:
         cells = true_channel[counted] * columns + channel[counted]
         self.counts += np.bincount(cells, minlength=self.counts.size).reshape(self.counts.shape)
 
-    def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
+    def __add__(self, other: "ConfusionMatrix") -> "ConfusionMatrix":
         if other.label_set.names != self.label_set.names:
             raise ShapeError(
                 f"confusion matrices of different label sets ('{self.label_set.name}' and '{other.label_set.name}') "

@@ -10,8 +10,6 @@ compared without its pixels on void, and is neither right nor wrong where most o
 too small, and found things without a number, are as if nothing had been found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -104,7 +102,7 @@ class PanopticCounts:
     def _by_class(self, channel: NDArray[np.int64], values: Any) -> Float64:
         return np.bincount(channel, weights=values, minlength=len(self.label_set)).astype(np.float64)
 
-    def __add__(self, other: PanopticCounts) -> PanopticCounts:
+    def __add__(self, other: "PanopticCounts") -> "PanopticCounts":
         if (other.label_set.names, other.stuff) != (self.label_set.names, self.stuff):
             raise ShapeError(f"panoptic counts of '{self.label_set.name}' and '{other.label_set.name}' cannot be added")
         total = PanopticCounts(self.label_set, self.stuff)

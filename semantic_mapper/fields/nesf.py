@@ -9,8 +9,6 @@ Its convolutions are *submanifold* ones over the occupied cells (Graham et al. 2
 output where there is an input and nowhere else, so that a surface stays a surface. Missing neighbours count as zeros.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import hashlib
@@ -224,7 +222,7 @@ class SurfacePoints(NamedTuple):
     log_p: Float32  # (N, L) log-probabilities of the votes; zeros without votes
     votes: Float32  # (N,)
 
-    def rows(self, chosen: NDArray[Any]) -> SurfacePoints:
+    def rows(self, chosen: NDArray[Any]) -> "SurfacePoints":
         """Some of them, by mask or row."""
         return SurfacePoints(*(values[chosen] for values in self))
 
@@ -361,7 +359,7 @@ class Nesf(nn.Module):
         with torch.no_grad():
             self.net.head.bias[-5], self.net.head.bias[-4] = 1.0, -1.0
 
-    def extended(self, label_set: LabelSet) -> Nesf:
+    def extended(self, label_set: LabelSet) -> "Nesf":
         """The same network for maps of more classes behind its own: votes for those are smoothed."""
         own, more = len(self.label_set), len(label_set) - len(self.label_set)
         found = Nesf(label_set, self.config)

@@ -1,7 +1,5 @@
 """S-Ray for streaming: the weights and the answer of ``SRay``, by OpenVINO and a compiled kernel on the CPU."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -44,7 +42,7 @@ class StreamedViews(NamedTuple):
         """Of the feature maps."""
         return self.feature.shape[1:], ()
 
-    def at(self, T_world_camera: Float64) -> StreamedViews:
+    def at(self, T_world_camera: Float64) -> "StreamedViews":
         """One view with another pose (4, 4)."""
         return self._replace(T_camera_world=_inverse(T_world_camera))
 
@@ -66,7 +64,7 @@ class StreamingSRay:
         tensors: Tensors,
         sampling: SamplingConfig | None = None,
         *,
-        like: StreamingSRay | None = None,
+        like: "StreamingSRay | None" = None,
     ) -> None:
         self.config = config
         self.label_set = label_set

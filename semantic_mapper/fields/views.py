@@ -3,8 +3,6 @@
 Source views come checked and at the size of feature maps (S-Ray Eq. 3 to 5).
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from collections.abc import Sequence
@@ -42,13 +40,13 @@ class EncodedViews:
         """Of the feature and the label maps; views of one size can be rendered from together."""
         return tuple(self.feature.shape[1:]), tuple(self.channel.shape[1:])
 
-    def at(self, T_world_camera: Float64) -> EncodedViews:
+    def at(self, T_world_camera: Float64) -> "EncodedViews":
         """One view with another pose (4, 4)."""
         like = self.T_camera_world
         pose = torch.tensor(T_world_camera, dtype=like.dtype, device=like.device)
         return replace(self, T_camera_world=invert_pose_torch(pose[None]))
 
-    def select(self, index: torch.Tensor) -> EncodedViews:
+    def select(self, index: torch.Tensor) -> "EncodedViews":
         """The views at ``index`` (k,) int64."""
         return EncodedViews(*(getattr(self, f.name)[index] for f in fields(self)))
 

@@ -1,7 +1,5 @@
 """Countable things in a map, with ids that stay with them while the map grows."""
 
-from __future__ import annotations
-
 import math
 import threading
 import weakref
@@ -144,7 +142,7 @@ class _Found(NamedTuple):
 
     snapshot: weakref.ref[MapSnapshot]
     voxels: ThingVoxels
-    components: Components
+    components: "Components"
     ids: Int64
     sizes: Int64
     along: dict[bytes, FoundThings]  # by the direction that was called up
@@ -222,7 +220,7 @@ class InstanceTracker:
         self._next_id += len(new)
         return _Found(weakref.ref(snapshot), voxels, found, ids, sizes, {})
 
-    def _match(self, last: _Found, voxels: ThingVoxels, found: Components, ids: Int64) -> None:
+    def _match(self, last: _Found, voxels: ThingVoxels, found: "Components", ids: Int64) -> None:
         """Write the id that each component had."""
         count = len(ids)
         blocks = np.union1d(last.voxels.packed, voxels.packed)

@@ -1,7 +1,5 @@
 """The loop of every fit: steps until the budget is used, looks at what is held out, and the weights that were best."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +43,7 @@ class FitTask(NamedTuple):
     label_set: LabelSet  # of their labels, and of the result
     start: LearnedField | None  # a field of one scene takes its config and its box, if it is fitted; None = nothing
     config: FinetuneConfig
-    budget: Budget
+    budget: "Budget"
 
     @property
     def labelled(self) -> list[PosedFrame]:
@@ -110,7 +108,7 @@ class Budget:
         yield
         self._last_look_s = time.monotonic() - began
 
-    def part(self, until: float, *, steps: int | None = None) -> Budget:
+    def part(self, until: float, *, steps: int | None = None) -> "Budget":
         """The budget of the next part of a fit, which ends at a fraction of this one: its time, and its progress.
         A late part has a twentieth of the time until there at least. ``steps``: None = those of the whole."""
         first, self._given = self._given, until

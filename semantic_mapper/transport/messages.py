@@ -5,8 +5,6 @@
 ``name/source/``, so that a subscription matches whole words only.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re
@@ -83,7 +81,7 @@ class LabelSetForm(Wire, frozen=True):
     ignore_id: ClassId
 
     @classmethod
-    def of(cls, labels: LabelSet) -> LabelSetForm:
+    def of(cls, labels: LabelSet) -> "LabelSetForm":
         """A label set as it travels."""
         classes = tuple(map(ClassForm, labels.ids, labels.names, labels.colors))
         return cls(labels.name, classes, labels.ignore_id)

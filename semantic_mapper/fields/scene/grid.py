@@ -4,8 +4,6 @@
 field. Kinds that know classes build on it and say what its samples mean.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
@@ -60,7 +58,7 @@ class RaySamples:
         """(R,) mean z of what rays meet."""
         return (self.weight * self.z).sum(1) / self.weight.sum(1).clamp_min(1e-6)
 
-    def at(self, index: torch.Tensor) -> RaySamples:
+    def at(self, index: torch.Tensor) -> "RaySamples":
         """The samples at positions (R, N) of each ray."""
         points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
         mover = None if self.mover is None else self.mover.gather(1, index)
@@ -153,7 +151,7 @@ class SceneGrid(nn.Module):
             cells = functional.max_pool3d(padded[None, None], CELL + 1, CELL)[0, 0]
             self.occupied.copy_(cells)
 
-    def resampled(self, config: GridConfig) -> SceneGrid:
+    def resampled(self, config: GridConfig) -> "SceneGrid":
         """This grid in another box or resolution."""
         other = SceneGrid(config).to(self.values.device)
         axes = [

@@ -3,8 +3,6 @@
 The loops are compiled (``kernels/src/scene_grid.c``) and run on the CPU, wherever the tensors are.
 """
 
-from __future__ import annotations
-
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
@@ -73,7 +71,7 @@ class SampleLists(NamedTuple):
     counts: Int64  # (R,) of the S that are there
 
     @classmethod
-    def empty(cls, rays: int, shape: tuple[int, ...], channels: int) -> SampleLists:
+    def empty(cls, rays: int, shape: tuple[int, ...], channels: int) -> "SampleLists":
         """Room for all samples of rays through a grid of this shape."""
         most = int(math.sqrt(sum((n - 1) ** 2 for n in shape[:3])) / STEP) + 3
         points, gradient = (np.empty((rays, most, n), np.float32) for n in (3, channels))
