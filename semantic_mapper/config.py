@@ -47,12 +47,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class EncoderConfig(Config, frozen=True):
     """Shape of the image encoder that all kinds of fields share."""
 
-    channels: Annotated[tuple[Channels, ...], msgspec.Meta(max_length=8)] = (
-        32,
-        64,
-        128,
-        192,
-    )  # of each stage; the first works at half the size of the image
+    # of each stage; the first works at half the size of the image
+    channels: Annotated[tuple[Channels, ...], msgspec.Meta(max_length=8)] = (32, 64, 128, 192)
     blocks: Annotated[tuple[Layers, ...], msgspec.Meta(max_length=8)] = (1, 2, 3, 3)  # residual blocks a stage
     # "efficientnet-lite0": a network that may start from ImageNet weights, between a small stem and a decoder;
     # ``channels`` and ``blocks`` are the decoder's then
@@ -188,9 +184,8 @@ class KeyframeConfig(Config, frozen=True):
     """When a frame becomes a source view, and which views a query uses."""
 
     translation_m: Positive = 0.15  # new keyframe when moved this far from the nearest one, or turned by 12 degrees
-    capacity: Annotated[int, msgspec.Meta(ge=1, le=4096)] = (
-        64  # keyframes kept; the one whose loss costs least coverage goes first
-    )
+    # keyframes kept; the one whose loss costs least coverage goes first
+    capacity: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 64
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
     # Weight of what its image says by itself, against the rendered view, in what it tells the map; its own labels are
@@ -255,9 +250,8 @@ class RenderConfig(Config, frozen=True):
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     # 1 = rays for all its pixels; below, for every fourth a side and, up to this fraction, where these are uncertain.
     ray_fraction: Fraction = 0.2
-    target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
-        0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
-    )
+    # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
+    target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
     # Of the source images when they are encoded; 0 = what the weights were trained at.
     encode_width: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 0
     device: Literal["cpu", "cuda"] = "cpu"  # where views are encoded and rendered; the map is always the CPU's

@@ -148,9 +148,8 @@ class PosedFrame:
     # ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth: nothing is scored
     # against it.
     label_is_pseudo: bool = False
-    world: int = (
-        0  # of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is
-    )
+    # of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is
+    world: int = 0
 
     def __post_init__(self) -> None:
         k = self.intrinsics

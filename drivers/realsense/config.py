@@ -13,9 +13,8 @@ Preset = Literal["as-is", "default", "hand", "high_accuracy", "high_density", "m
 class Config(semantic_mapper.config.Config, frozen=True):
     """A RealSense: one colour camera, and depth aligned to it. It has no odometry: poses come from elsewhere."""
 
-    device: str = (
-        ""  # serial number, as `semantic-mapper doctor --cameras` shows it; empty = the only one that is connected
-    )
+    # serial number, as `semantic-mapper doctor --cameras` shows it; empty = the only one that is connected
+    device: str = ""
     width: AtLeastOne = 640  # of the colour images; sizes and rates are those that the device offers
     height: AtLeastOne = 480
     fps: Annotated[int, msgspec.Meta(ge=1, le=300)] = 30

@@ -121,10 +121,7 @@ def _recipe_lines(recipe: dict[str, Any], chosen: int) -> list[str]:
             f"pseudo labels ({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{percent(boxed['matched'])}"
         )
-        left_out = {
-            "unseen": "that no frame sees",
-            "lost": "that move, which no frame shows at their times",
-        }
+        left_out = {"unseen": "that no frame sees", "lost": "that move, which no frame shows at their times"}
         if any(boxed[name] for name in left_out):
             reasons = (f"{boxed[name]} {reason}" for name, reason in left_out.items() if boxed[name])
             lines.append(f"boxes left out: {'; '.join(reasons)}")

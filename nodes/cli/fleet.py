@@ -9,15 +9,7 @@ from rich.table import Table
 
 from semantic_mapper.config import AtLeastZero, MapperConfig
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.nodes.cli.verb import (
-    EXIT_FAILED,
-    JsonOutput,
-    Settings,
-    complete,
-    set_option,
-    verb,
-    wrong_usage,
-)
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, JsonOutput, Settings, complete, set_option, verb, wrong_usage
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.console import table as make_table
 from semantic_mapper.nodes.fleet.cluster import connected

@@ -24,6 +24,7 @@ import typer
 from rich.text import Text
 from typer.models import ParameterInfo
 
+from semantic_mapper import setting_docs
 from semantic_mapper.config import (
     Config,
     MapperConfig,
@@ -39,14 +40,6 @@ from semantic_mapper.errors import ConfigError, EmptyMapError, LogError, Semanti
 from semantic_mapper.nodes.console import Output, stderr_console
 from semantic_mapper.nodes.process import failure_message, prepare_process
 from semantic_mapper.plain_text import visible, without_secrets
-from semantic_mapper.setting_docs import (
-    BOUNDLESS,
-    Setting,
-    comments_of,
-    comments_of_parameters,
-    settings_of,
-    without_bounds,
-)
 from semantic_mapper.transport.launches import LIVE, read_launch_note, running_launches
 
 if TYPE_CHECKING:
@@ -65,11 +58,7 @@ ConfigT = TypeVar("ConfigT", bound=Config)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone (docs/json.md)")]
 JsonOutput = Annotated[Output, JsonOption]  # of a verb that has this option
 WeightsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--weights",
-        help="File, or `rooms-computed-depth` (no depth sensor)",
-    ),
+    Path | None, typer.Option("--weights", help="File, or `rooms-computed-depth` (no depth sensor)")
 ]
 MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
@@ -81,7 +70,7 @@ def set_option(completed: Callable[..., list[str]]) -> Any:
     return typer.Option("--set", metavar="NAME=VALUE", help="Any setting; may be repeated", autocompletion=completed)
 
 
-def complete(settings: Iterable[Setting], incomplete: str) -> list[str]:
+def complete(settings: Iterable[setting_docs.Setting], incomplete: str) -> list[str]:
     """NAME=VALUE of settings that begin so, with each value that is possible, else with the default."""
     found: list[str] = []
     for setting in settings:
@@ -135,7 +124,7 @@ class Options(msgspec.Struct, frozen=True):
     @classmethod
     def parameters(cls) -> list[inspect.Parameter]:
         """The options, as parameters of a command."""
-        hints, texts = get_type_hints(cls, include_extras=True), comments_of(cls)
+        hints, texts = get_type_hints(cls, include_extras=True), setting_docs.comments_of(cls)
         return [
             _option(field.name, hints[field.name], field.default, texts[field.name], hidden=cls.hidden)
             for field in msgspec.structs.fields(cls)
@@ -160,7 +149,7 @@ class SettingOptions:
     @classmethod
     def parameters(cls) -> list[inspect.Parameter]:
         """As of ``Options``."""
-        declared = {setting.name: setting for setting in settings_of(cls.kind)}
+        declared = {setting.name: setting for setting in setting_docs.settings_of(cls.kind)}
         found: list[inspect.Parameter] = []
         for option, name in cls.options.items():
             setting = declared[name]
@@ -168,13 +157,9 @@ class SettingOptions:
             info = typer.Option(option, help=f"{_sentence(setting.text)}  [default: {default}]", show_default=False)
             bounded = Annotated[setting.type, msgspec.Meta(ge=setting.low, le=setting.high)]
             found.append(_parameter(_parameter_name(option), bounded, info, None))
-        completed = set_option(lambda incomplete: complete(settings_of(cls.kind), incomplete))
+        completed = set_option(lambda incomplete: complete(setting_docs.settings_of(cls.kind), incomplete))
         listed = typer.Option("--config", help="TOML file of settings (docs/settings.md)")
-        return [
-            *found,
-            _parameter("config", Path | None, listed, None),
-            _parameter("set", list[str], completed, None),
-        ]
+        return [*found, _parameter("config", Path | None, listed, None), _parameter("set", list[str], completed, None)]
 
     @property
     @wrong_usage()
@@ -238,7 +223,7 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     to print. As a ``JsonOutput`` it brings the option ``--json``.
     """
     signature = inspect.signature(function, eval_str=True)
-    texts = comments_of_parameters(function)
+    texts = setting_docs.comments_of_parameters(function)
     groups: dict[str, type[Options | SettingOptions]] = {}
     parameters: list[inspect.Parameter] = []
     for name, parameter in signature.parameters.items():
@@ -254,7 +239,7 @@ def verb(function: Callable[..., int | None]) -> Callable[..., None]:
     if with_json:
         parameters.append(_parameter("json", JsonOption, typer.Option(), False))
 
-    bounds = {parameter.name: without_bounds(parameter.annotation)[1:] for parameter in parameters}
+    bounds = {parameter.name: setting_docs.without_bounds(parameter.annotation)[1:] for parameter in parameters}
 
     @functools.wraps(function)
     def command(**values: Any) -> None:
@@ -301,9 +286,9 @@ def refuse_options(*rules: tuple[object, str, str]) -> None:
 
 def _option(name: str, kind: Any, default: Any, text: str, *, hidden: bool = False) -> inspect.Parameter:
     said = "--" + name.rstrip("_").replace("_", "-")
-    if without_bounds(kind)[0] is bool and default:
+    if setting_docs.without_bounds(kind)[0] is bool and default:
         said += f"/--no-{said[2:]}"
-    metavar = "<str>" if get_origin(without_bounds(kind)[0]) is list else None
+    metavar = "<str>" if get_origin(setting_docs.without_bounds(kind)[0]) is list else None
     shown = default not in (0, "0")
     info = typer.Option(said, help=_sentence(text), show_default=shown, hidden=hidden, metavar=metavar)
     return _parameter(name, kind, info, default)
@@ -320,7 +305,7 @@ def _parameter(name: str, kind: Any, info: ParameterInfo, default: Any) -> inspe
         given.help, given.metavar = given.help or info.help, given.metavar or info.metavar
         given.show_default = info.show_default
     else:
-        declared, low, high = without_bounds(kind)
+        declared, low, high = setting_docs.without_bounds(kind)
         kind = Annotated[declared | None if default is None else declared, info, msgspec.Meta(ge=low, le=high)]
     default = inspect.Parameter.empty if default is msgspec.NODEFAULT else default
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -346,7 +331,7 @@ def must_be_there(*paths: Path) -> None:
 
 def _check_bounds(name: str, value: object, low: float | None, high: float | None) -> None:
     """Refuse numbers beyond what the declaration allows, and those that nothing can be computed with, as NaN."""
-    low, high = -BOUNDLESS if low is None else low, BOUNDLESS if high is None else high
+    low, high = -setting_docs.BOUNDLESS if low is None else low, setting_docs.BOUNDLESS if high is None else high
     for item in value if isinstance(value, tuple | list) else (value,):
         if isinstance(item, int | float) and not low <= item <= high:
             hint = f"--{name.rstrip('_').replace('_', '-')}"

@@ -4,8 +4,6 @@ A client that does not keep up loses the oldest of what waits for it. What nobod
 On import, raises DependencyError: the extra is not installed.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

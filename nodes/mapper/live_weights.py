@@ -1,7 +1,5 @@
 """Weights offered to a mapper while it maps: read in a thread, compared with the map, exchanged between two frames."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Files of the weights that a mapper is offered; a finetuner reads them, too, and loads no mapper for that."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from semantic_mapper.errors import WeightsError

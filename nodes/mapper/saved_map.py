@@ -1,7 +1,5 @@
 """The saved map of a running mapper: how it is written now and then, and how a mapper resumes that of a killed one."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

@@ -20,12 +20,7 @@ from semantic_mapper.types import PosedFrame
 
 LogFormat = Literal["foxglove", "trajectory", "tum", "folder"]
 FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
-_SUFFIXES: dict[str, LogFormat] = {
-    ".mcap": "foxglove",
-    ".txt": "trajectory",
-    ".tum": "trajectory",
-    "": "folder",
-}
+_SUFFIXES: dict[str, LogFormat] = {".mcap": "foxglove", ".txt": "trajectory", ".tum": "trajectory", "": "folder"}
 _FOLDERS = ("tum", "folder")
 _ONE_CAMERA = ("trajectory", "tum", "folder")
 

@@ -188,9 +188,8 @@ def _rectified_camera(file: Path, which: str) -> tuple[CameraIntrinsics, Float64
     width, height = _calibrated(file, f"S_rect_{which}", 2)
     intrinsics = camera_of(f"{file}: P_rect_{which} and S_rect_{which}", P[[0, 1, 0, 1], [0, 1, 2, 2]], (width, height))
     T_cam0_camera = np.eye(4)
-    T_cam0_camera[:3, 3] = -np.linalg.solve(
-        camera_matrix(intrinsics), P[:, 3]
-    )  # P = K [I | t] takes points of the left camera
+    # P = K [I | t] takes points of the left camera
+    T_cam0_camera[:3, 3] = -np.linalg.solve(camera_matrix(intrinsics), P[:, 3])
     return intrinsics, T_cam0_camera
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semantic_mapper.drivers.calibration import Rectifier
 from semantic_mapper.errors import CodecError, ImportSourceError
 from semantic_mapper.geometry import invert_pose, scale_intrinsics, transform, unproject
-from semantic_mapper.replay.importers import ros_bags
+from semantic_mapper.replay.importers import ros_bags, ros_transforms
 from semantic_mapper.replay.importers.base import (
     MATCH_NS,
     BadFrameError,
@@ -28,14 +28,6 @@ from semantic_mapper.replay.importers.base import (
     same_view,
 )
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, depth_of_size
-from semantic_mapper.replay.importers.ros_transforms import (
-    WORLD_FRAMES,
-    PoseSeries,
-    Track,
-    TransformTree,
-    fill_stamps,
-    stamp_of,
-)
 from semantic_mapper.replay.importers.tum import match_nearest
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, UInt8
@@ -214,12 +206,12 @@ class _BagReader:
         stamps: dict[str, list[int]] = {name: [] for name in images}
         self._received: dict[str, list[int]] = {name: [] for name in images}
         self._calibrations: dict[str, list[ros_bags.Calibration]] = {name: [] for name in infos}
-        self._poses = {name: PoseSeries() for name in poses}
+        self._poses = {name: ros_transforms.PoseSeries() for name in poses}
         self._bodies: dict[str, str] = {}  # of topics of poses that tell whose they are
-        self._tree = TransformTree()
+        self._tree = ros_transforms.TransformTree()
         for name, received_ns, message, node in self._bag.messages(images | infos | poses | transforms):
             if name in images:
-                stamps[name].append(stamp_of(message.header))
+                stamps[name].append(ros_transforms.stamp_of(message.header))
                 self._received[name].append(received_ns)
             elif name in infos:
                 found, known = ros_bags.Calibration(message), self._calibrations[name]
@@ -233,7 +225,7 @@ class _BagReader:
                 self._bodies.setdefault(name, getattr(message, "child_frame_id", ""))
         self.notices += self._tree.close()
         for name in images:
-            self.notices += fill_stamps(stamps[name], self._received[name], name)
+            self.notices += ros_transforms.fill_stamps(stamps[name], self._received[name], name)
         self._stamps = {name: np.array(values, np.int64) for name, values in stamps.items()}
 
     def _intrinsics(self, topic: ros_bags.Topic, info: str) -> CameraIntrinsics:
@@ -340,13 +332,13 @@ class _BagReader:
         """The topic that poses come from; empty = tf."""
         found = self._bag.topics(*ros_bags.POSES)
         name = self._named("pose", found)
-        if name or self._options.world or set(WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
+        if name or self._options.world or set(ros_transforms.WORLD_FRAMES) & set(self._tree.way_up(self._frame)):
             return name
         if len(found) > 1:
             raise _several("pose", found, found[0])
         return found[0] if found else ""
 
-    def _track(self, topic: str) -> tuple[str, Track]:
+    def _track(self, topic: str) -> tuple[str, ros_transforms.Track]:
         """Whose poses a topic tells, and the poses."""
         body, frame = ros_bags.frame_name(self._options.body or self._bodies[topic]), self._frame
         if not body:
@@ -373,7 +365,7 @@ class _BagReader:
         """The frame of tf in which poses are."""
         way = self._tree.way_up(self._frame)
         wanted = ros_bags.frame_name(self._options.world)
-        frames = (wanted,) if wanted else WORLD_FRAMES
+        frames = (wanted,) if wanted else ros_transforms.WORLD_FRAMES
         world = next((world for world in frames if world in way), None)
         if world is not None:
             return world

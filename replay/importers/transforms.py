@@ -42,14 +42,8 @@ _REFUSED = re.compile(
 )
 _OUR_AXES = ("opengl", "blender", "nerf", "nerfstudio", "arkit")
 _BELIEVABLE_S = (1e-3, 10.0)  # between two frames
-_FOCAL = (
-    "fl_x",
-    "fl_y",
-    "camera_angle_x",
-    "camera_angle_y",
-    "x_fov",
-    "y_fov",
-)  # a frame's own stand for all of the file's
+# A frame's own stand for all of the file's.
+_FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _Row = tuple[float, float, float, float]
 _Matrix = Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
 
@@ -104,9 +98,8 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     plain = {key: value for key, value in tables.read_plain_json(file).items() if value not in _OUR_AXES}
     found = tables.convert_known(plain, _Transforms, file)
     tables.refuse_keys(plain, _REFUSED, file)
-    notices = tables.unknown_notice(file, [plain], _Transforms, _NEUTRAL) + tables.unknown_notice(
-        file, found.frames, _Frame
-    )
+    notices = tables.unknown_notice(file, [plain], _Transforms, _NEUTRAL)
+    notices += tables.unknown_notice(file, found.frames, _Frame)
     shared = {name: value for name in _Lens.__struct_fields__ if (value := getattr(found, name)) is not None}
 
     def read_frame(numbered: tuple[int, dict[str, Any]]) -> tuple[_Frame, Path]:

@@ -6,14 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semantic_mapper.bundle.keyframes import (
-    BundleProblem,
-    BundleResult,
-    Keyframe,
-    KeyframeMap,
-    adjust_bundle,
-    reprojection_errors,
-)
+from semantic_mapper.bundle import keyframes
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.geometry import invert_pose, nearest_pose, pose_distance, transform
@@ -51,7 +44,7 @@ class _Frame:
     """A frame whose pose may still change."""
 
     key: tuple[str, int]
-    keyframe: Keyframe
+    keyframe: keyframes.Keyframe
     T_keyframe_camera: Float64
     reported: Float64  # T_world_camera
     tracks: Tracks | None  # of a frame that no points were known for yet; None of all others
@@ -66,14 +59,14 @@ class PoseRefiner:
         self._config = config
         self._intrinsics = intrinsics
         self._tracker = Tracker(_CORNERS)
-        self._map = KeyframeMap(working_intrinsics(intrinsics, _WIDTH), _WINDOW)
+        self._map = keyframes.KeyframeMap(working_intrinsics(intrinsics, _WIDTH), _WINDOW)
         self._frames: list[_Frame] = []
         self._given: Float64 | None = None  # pose of the frame before
         self._refined = np.eye(4)
         self._sigma_m = config.sigma_m  # of the last given pose
         self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
-        self._pending: tuple[BundleProblem, Future[BundleResult]] | None = None
+        self._pending: tuple[keyframes.BundleProblem, Future[keyframes.BundleResult]] | None = None
 
     def push(self, frame: PosedFrame) -> RefinedPose:
         """Refine the next frame's pose."""
@@ -93,7 +86,7 @@ class PoseRefiner:
         is_keyframe = self._map.wants_keyframe(tracks)
         if is_keyframe:
             number = self._map.keyframes[-1].number + 1 if self._map.keyframes else 0
-            self._map.add(Keyframe(number, self._tracker.replenish(), pose, given, self._sigmas(frame)))
+            self._map.add(keyframes.Keyframe(number, self._tracker.replenish(), pose, given, self._sigmas(frame)))
             self._adjust()
         last = self._map.keyframes[-1]
         relative = invert_pose(last.T_world_camera) @ self._refined
@@ -181,16 +174,16 @@ class PoseRefiner:
         if problem is None:
             return
         if self._worker is None:
-            self._apply(problem, adjust_bundle(problem, _ITERATIONS))
+            self._apply(problem, keyframes.adjust_bundle(problem, _ITERATIONS))
         else:
-            self._pending = problem, self._worker.submit(adjust_bundle, problem, _ITERATIONS)
+            self._pending = problem, self._worker.submit(keyframes.adjust_bundle, problem, _ITERATIONS)
 
     def _collect(self, wait: bool) -> None:
         if self._pending is not None and (wait or self._pending[1].done()):
             (problem, future), self._pending = self._pending, None
             self._apply(problem, future.result())
 
-    def _apply(self, problem: BundleProblem, found: BundleResult) -> None:
+    def _apply(self, problem: keyframes.BundleProblem, found: keyframes.BundleResult) -> None:
         last = self._map.keyframes[-1]
         before = invert_pose(last.T_world_camera)
         self._map.apply(problem, found)
@@ -204,7 +197,7 @@ class PoseRefiner:
         last, small = self._map.keyframes[-1], self._map.intrinsics
         in_last = transform(invert_pose(last.T_world_camera), known)
         errors = [
-            reprojection_errors(transform(T, in_last), tracks.pixels[mask], small)
+            keyframes.reprojection_errors(transform(T, in_last), tracks.pixels[mask], small)
             for T in (invert_pose(given) @ last.prior, invert_pose(refined) @ last.T_world_camera)
         ]
         factor = self._intrinsics.width / small.width

@@ -6,8 +6,6 @@ was computed somewhere, PLY and NPZ have ``measured``: 0 there, 1 where a sensor
 has y up: the mesh's node holds the rotation, vertices keep the coordinates of the world; colours are linear light, 16
 bits so that sRGB's 8 survive."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import struct

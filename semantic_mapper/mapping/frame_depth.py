@@ -1,7 +1,5 @@
 """Where the depth of a frame comes from: its sensor, the pictures of a moving camera, or neither."""
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable

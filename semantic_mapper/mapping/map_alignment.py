@@ -1,7 +1,5 @@
 """Where one map lies in another: the places of one are looked for in the other."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

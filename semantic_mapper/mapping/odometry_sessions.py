@@ -3,8 +3,6 @@
 A camera that tracks itself begins its world where it starts. Its frames are held until several of them are found in the
 map (``localization.relocalizer``), each by itself, and agree with each other and with the camera's own motion."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import Any

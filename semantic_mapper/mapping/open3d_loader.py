@@ -1,8 +1,6 @@
 """The one file that imports Open3D. Its wheel links ``libusb-1.0``, ``libGL`` and others without shipping them; loaded
 here with RTLD_GLOBAL, they need not be installed system-wide."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import importlib

@@ -5,8 +5,6 @@ calibrated. Points found from corners and given poses are projected into the nex
 elsewhere, poses do not fit; where they are farther from the centre by one factor, three times in a row, the focal
 length has changed. A rolling shutter is not detected."""
 
-from __future__ import annotations
-
 from collections import Counter, OrderedDict, deque
 
 import cv2

@@ -12,8 +12,6 @@ as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 
 Poses that stand still give no pairs, and pictures may not show one view after the other. A quarter of the parts of a
 still camera's pictures correlate by 0.99, whoever walks before it; in a walk through a kitchen 0.3 after 1.5 s."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace

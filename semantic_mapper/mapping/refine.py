@@ -4,8 +4,6 @@ The map is read in tiles, so that memory does not grow with it; they overlap by 
 answers is written back as evidence that reads as exactly that. TSDF, colour and weights stay as they are, bit for bit.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ surface in need of class votes (``surface_patches``). Its score is the need of w
 keyframes see that, too, and by nearness. What was looked at once is not looked at again. TSDF, colour and weight stay
 as they are, to the bit, and no block is added."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
