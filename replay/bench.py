@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,21 +12,19 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.config import MapperConfig, VoxelMapConfig
-from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb
 from semantic_mapper.kernels.binding import thread_count
-from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.replay.peers.comparison import WARM_UP, read_frames
 from semantic_mapper.replay.peers.fusion import Open3DFusion, make_setup, some_votes
 from semantic_mapper.types import PosedFrame
 
 WIDTH, HEIGHT = 640, 480  # of the frames that are measured
 CLASSES = (20, 40)
-WARM_UP = 3  # frames that do not count: first growth of buffers
 
 
 def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02, repeats: int = 5) -> dict[str, Any]:
@@ -38,7 +35,7 @@ def bench_fusion(log: Path, frames: int = 20, voxel_size_m: float = 0.02, repeat
     Gives plain data: milliseconds a frame, medians of all; ``ratio_20`` and ``ratio_40``, ours over Open3D's, each the
     median of those of the repeats, the least and the largest.
     """
-    posed, _ = _frames(log, frames + WARM_UP)
+    posed = [_resized(frame) for frame in read_frames(log, frames + WARM_UP)[0]]
     config = VoxelMapConfig(voxel_size_m=voxel_size_m)
     votes = {count: some_votes(count, (HEIGHT, WIDTH)) for count in CLASSES}
     medians: list[dict[str, float]] = []
@@ -82,7 +79,8 @@ def bench_pipeline(log: Path, weights: Path | None, config: MapperConfig, frames
     mIoU of the rendered labels (None for a log without labels).
     """
     pipeline = Mapper.load(weights, config).pipeline
-    posed, label_set = _frames(log, frames + WARM_UP)
+    posed, label_set = read_frames(log, frames + WARM_UP)
+    posed = [_resized(frame) for frame in posed]
     if config.depth.source == "computed":
         posed = [dataclasses.replace(frame, depth_m=None) for frame in posed]
     steps: list[float] = []
@@ -115,16 +113,6 @@ def bench_pipeline(log: Path, weights: Path | None, config: MapperConfig, frames
         "quality": config.quality,
         "depth": "computed" if config.depth.source == "computed" else "sensor",
     }
-
-
-def _frames(log: Path, count: int) -> tuple[list[PosedFrame], LabelSet | None]:
-    """The first frames of a log with depth, at 640x480, and the label set of their labels."""
-    with LogReader(log) as reader:
-        frames = [_resized(f) for f in itertools.islice((f for f in reader if f.depth_m is not None), count)]
-        label_set = reader.info.label_set
-    if len(frames) <= WARM_UP:
-        raise LogError(f"{log}: {len(frames)} frames with depth; this needs more than {WARM_UP}")
-    return frames, label_set
 
 
 def _resized(frame: PosedFrame) -> PosedFrame:

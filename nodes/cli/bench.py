@@ -97,7 +97,7 @@ def _bench_peers(
         *((name not in PEERS, "--python", f"no peer {name!r}{nearest(name, list(PEERS))}") for name in pythons)
     )
     with frame_progress("measure", None, "runs") as bar:
-        given = read_frames(log, frames), config.voxel_map
+        given = read_frames(log, frames)[0], config.voxel_map
         found = compare_peers(*given, truth=truth, pythons=pythons, seed=config.seed, monitor=bar)
     for kind, scores in _SCORES.items():
         names = (kind, "CPU ms a frame", *(name for name, _, _ in (*_COSTS, *scores)))

@@ -1,1 +1,1 @@
-"""Other mappers and odometries, measured beside ours on one log."""
+"""Other mappers and odometries, measured on one log with ours."""

@@ -21,6 +21,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LogError
 from semantic_mapper.files import write_json
 from semantic_mapper.geometry import align_similar, invert_pose, pose_distance
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.evaluate.mesh_surface import read_mesh, surface_figures
 from semantic_mapper.replay.job_monitor import JobMonitor
 from semantic_mapper.replay.log.format import LogReader
@@ -30,7 +31,7 @@ from semantic_mapper.types import Float64, PosedFrame
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WARM_UP = 3  # frames that do not count
+WARM_UP = 3  # frames that do not count: first growth of buffers
 _HERE = "semantic_mapper.replay.peers"
 _EXTRA = "pip install 'semantic-mapper[peers]'"
 _OWN = "uv venv -p 3.10 vdb && uv pip install -p vdb vdbfusion 'numpy<2', then --python vdbfusion=vdb/bin/python"
@@ -59,18 +60,20 @@ PEERS = {
 }
 
 
-def read_frames(log: Path, count: int) -> list[PosedFrame]:
-    """The first frames with depth of the first camera of a log. Raises LogError: there are too few."""
+def read_frames(log: Path, count: int) -> tuple[list[PosedFrame], LabelSet | None]:
+    """The first frames with depth of the first camera of a log, and the label set of their labels. Raises LogError:
+    there are too few."""
     with LogReader(log) as reader:
         with_depth = (frame for frame in reader if frame.depth_m is not None)
         first = next(with_depth, None)
         same = (f for f in with_depth if first and (f.camera_id, f.intrinsics) == (first.camera_id, first.intrinsics))
         frames = [first, *itertools.islice(same, count - 1)] if first else []
+        label_set = reader.info.label_set
     if len(frames) <= WARM_UP or frames[0].intrinsics.distorted:
         raise LogError(
             f"{log}: {len(frames)} rectified frames with depth of one camera; this needs more than {WARM_UP}"
         )
-    return frames
+    return frames, label_set
 
 
 def compare_peers(
@@ -161,7 +164,9 @@ def draw_peers(found: Mapping[str, Any]) -> Figure:
         names = [row["title"] for row in rows]
         middle, low, high = np.array([row["cpu_ms"] for row in rows]).reshape(-1, 3).T
         line[0].barh(names, middle, xerr=(middle - low, high - middle), ecolor=plots.hex_color(plots.TEXT))
-        line[0].set(title=f"{kind}: CPU ms a frame, one thread; least to largest of {found['repeats']}", xscale="log")
+        title = f"{kind}: CPU ms a frame, one thread; least to largest of {found['repeats']}"
+        line[0].set(title=title, xscale="log", xlim=(1, None))
+        line[0].xaxis.set_major_formatter("{x:g}")
         line[1].barh(names, [row["peak_mb"] - row["loaded_mb"] for row in rows], color=plots.CYCLE[1])
         line[1].set(title="peak memory without the frames, MB", yticklabels=[])
     return figure
