@@ -22,7 +22,7 @@ from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.replay.log import demo_log
 
 # Columns of a table: name, field of the JSON, and its unit in that of the column.
-_COSTS = (("peak MB", "peak_mb", 1), ("of it frames", "loaded_mb", 1))
+_COSTS = (("peak MB", "peak_mb", 1), ("loaded", "loaded_mb", 1))
 _SCORES = {
     "mapper": (("surface mm", "median_m", 1e3), ("complete %", "complete", 100), ("ghosts %", "ghosts", 100)),
     "odometry": (("RPE mm", "rpe_m", 1e3), ("RPE deg", "rpe_deg", 1), ("ATE mm", "ate_m", 1e3), ("lost", "lost", 1)),
@@ -100,9 +100,9 @@ def _bench_peers(
         given = read_frames(log, frames)[0], config.voxel_map
         found = compare_peers(*given, truth=truth, pythons=pythons, seed=config.seed, monitor=bar)
     for kind, scores in _SCORES.items():
-        names = (kind, "CPU ms a frame", *(name for name, _, _ in (*_COSTS, *scores)))
+        names = (kind, "CPU ms", "least", "most", *(name for name, _, _ in (*_COSTS, *scores)))
         rows = [
-            (row["title"], "{:g} ({:g} to {:g})".format(*row["cpu_ms"]), *_cells(row, (*_COSTS, *scores)))
+            (row["title"], *(f"{value:.4g}" for value in row["cpu_ms"]), *_cells(row, (*_COSTS, *scores)))
             for row in found["peers"]
             if row["kind"] == kind and row["cpu_ms"]
         ]
@@ -112,13 +112,15 @@ def _bench_peers(
         output.print(table(absent, ("not measured", "why", "install")))
     if truth is None:
         output.print("surfaces are not compared: --truth gives a mesh")
-    output.print(f"{found['frames']} frames, {config.voxel_map.voxel_size_m:g} m voxels, one thread, {log}")
+    output.print(
+        f"{found['frames']} frames, {config.voxel_map.voxel_size_m:g} m voxels, one thread; CPU ms a frame; {log}"
+    )
     return found
 
 
 def _cells(row: dict[str, Any], columns: Iterable[tuple[str, str, float]]) -> list[str | None]:
     values = [(row.get(name), unit) for _, name, unit in columns]
-    return [None if value is None else f"{value * unit:.4g}" for value, unit in values]
+    return [None if value is None else f"{round(value * unit, 2):.4g}" for value, unit in values]
 
 
 def cpu_name() -> str:

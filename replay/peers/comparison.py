@@ -49,7 +49,7 @@ class PeerKind(NamedTuple):
 PEERS = {
     "ours": PeerKind("mapper", "ours, 20 classes", f"{_HERE}.fusion:ours_with_classes"),
     "ours-no-classes": PeerKind("mapper", "ours, no classes", f"{_HERE}.fusion:ours"),
-    "open3d": PeerKind("mapper", "Open3D VoxelBlockGrid", f"{_HERE}.fusion:open3d"),
+    "open3d": PeerKind("mapper", "Open3D grid", f"{_HERE}.fusion:open3d"),
     "opencv": PeerKind("mapper", "OpenCV HashTSDF", "opencv", "pip install 'opencv-contrib-python-headless>=5'"),
     "vdbfusion": PeerKind("mapper", "VDBFusion", "vdbfusion", _OWN),
     "octomap": PeerKind("mapper", "OctoMap", "octomap"),
