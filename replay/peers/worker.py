@@ -82,13 +82,13 @@ def opencv(setup: Setup) -> Peer:
 
 
 def vdbfusion(setup: Setup) -> Peer:
-    """Without space carving, as in its own examples."""
+    """Without space carving, as in its own examples. Its mesh with holes filled has a second sheet, behind surfaces."""
     make = import_module("vdbfusion").VDBVolume
     if int(np.__version__.split(".")[0]) > 1:
         raise ImportError(f"vdbfusion ends in a segmentation fault with NumPy {np.__version__}; it needs numpy<2")
     volume = make(setup.voxel_size_m, setup.truncation_m, False)
     prepare = partial(_world_points, setup)
-    return Peer(lambda given: volume.integrate(*given), lambda: volume.extract_triangle_mesh()[0], prepare)
+    return Peer(lambda given: volume.integrate(*given), lambda: volume.extract_triangle_mesh(False)[0], prepare)
 
 
 def octomap(setup: Setup) -> Peer:
