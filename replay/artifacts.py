@@ -85,7 +85,7 @@ def finish_session(
     graph = find_graph(voxel_map)
     progress()
     unit = "m" if voxel_map.scale_known else "units"
-    poses = [f.T_world_camera for f, _ in session.snapshots]
+    poses = [snapshot.T_world_camera for snapshot in session.snapshots]
     up = camera_up(np.stack(poses)) if poses else None
     size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
     overview = draw_overview(
@@ -143,7 +143,7 @@ def _view_strips(session: MapSession, count: int) -> Iterator[ViewStrip]:
     """Frames of a session with what was rendered for them, at most ``count``, evenly spread."""
     kept = session.snapshots
     for index in np.linspace(0, len(kept) - 1, min(count, len(kept))).round().astype(int):
-        frame, update = kept[index]
+        frame, update = kept[index].open()
         truth = None
         if session.truth is not None and frame.label is not None:
             truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")

@@ -25,7 +25,8 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.odometry_sessions import OdometrySessions, Taken
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.types import MapUpdate, PosedFrame
+from semantic_mapper.transport.codec import decode_as, encode
+from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
     from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -52,6 +53,24 @@ class Refusal:
     stamp_ns: int
     reason: str
     camera_id: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A frame as the map has it and what became of it, packed: as they are, most of 5 MB."""
+
+    T_world_camera: Float64  # (4, 4)
+    packed: tuple[list[bytes], list[bytes]]
+
+    @classmethod
+    def of(cls, frame: PosedFrame, update: MapUpdate) -> Snapshot:
+        """Pack both, without a loss but for the confidence, which is rounded to 1/255."""
+        return cls(frame.T_world_camera, (encode(frame), encode(update)))
+
+    def open(self) -> tuple[PosedFrame, MapUpdate]:
+        """Both again."""
+        frame, update = self.packed
+        return decode_as(PosedFrame, frame), decode_as(MapUpdate, update)
 
 
 class BoundedLog(Generic[ItemT]):
@@ -143,7 +162,7 @@ class MapSession:
         self.per_image = ImageMeans()
         self.truth = None if stream_labels is None else TruthMapper(stream_labels, self.pipeline.label_set)
         self.surface_truth = SurfaceTruth(self.pipeline.label_set)
-        self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
+        self.snapshots: list[Snapshot] = []
         self._snapshot_stride = 1
         self.rerun = rerun
         if rerun is not None:
@@ -209,7 +228,7 @@ class MapSession:
         frame = self.pipeline.corrector.place(frame)  # where the map has it
         scored = self._score(frame, update)
         if self.fused % self._snapshot_stride == 0:  # a bounded, evenly spread sample of the session
-            self.snapshots.append((scored, update))
+            self.snapshots.append(Snapshot.of(scored, update))
         if len(self.snapshots) > SNAPSHOTS:
             self.snapshots = self.snapshots[::2]
             self._snapshot_stride *= 2

@@ -170,7 +170,7 @@ class LiveWeights(Closing):
         """One piece of the work. Errors: these weights cannot be used, which says nothing about their labels."""
         if task.trial is None:
             spread = session.snapshots[:: -(-len(session.snapshots) // COMPARED)]
-            frames = () if task.requested else tuple(frame for frame, _ in spread)
+            frames = () if task.requested else tuple(snapshot.open()[0] for snapshot in spread)
             field = make_field(found, session.pipeline.config, session.pipeline.field)
             task.trial = FieldTrial(session.pipeline, field, found.anchors, frames)
         if not task.trial.advance():

@@ -4,14 +4,15 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import zstandard
 
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.imaging import resize_depth, resize_label, working_intrinsics
 from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
+from semantic_mapper.transport.images import DepthSpec, Uint8Spec, encode_depth, encode_uint8
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 TRUTH_WIDTH = 320
+DEPTH_SCALE = 1000.0  # units a metre that depth is packed in where that is exact
 MAX_FRAMES = 400  # frames whose truth is kept; beyond that every second one goes
 AGREEMENT_M = 0.04  # a frame votes on a surface point only where its depth is this near to it
 
@@ -35,7 +36,8 @@ class _TruthView(NamedTuple):
     stamp_ns: int
     T_world_camera: Float64
     intrinsics: CameraIntrinsics
-    packed: bytes  # depth, float32 metres, and label of every pixel, by Zstandard
+    depth: tuple[DepthSpec, bytes]
+    label: tuple[Uint8Spec, bytes]
 
 
 class SurfaceTruth:
@@ -54,8 +56,8 @@ class SurfaceTruth:
         if self._seen % self._stride == 0:
             k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
             depth, label = resize_depth(frame, k), resize_label(frame.label, k)
-            packed = zstandard.compress(depth.tobytes() + label.tobytes(), 1)
-            self._frames.append(_TruthView(frame.camera_id, frame.stamp_ns, frame.T_world_camera, k, packed))
+            packed = encode_depth(depth, DEPTH_SCALE), encode_uint8(label)
+            self._frames.append(_TruthView(frame.camera_id, frame.stamp_ns, frame.T_world_camera, k, *packed))
         self._seen += 1
         if len(self._frames) > MAX_FRAMES:
             self._frames = self._frames[::2]
@@ -76,11 +78,10 @@ class SurfaceTruth:
             p = transform(invert_pose(view.T_world_camera), points)
             inside, row, column = nearest_pixels(p, view.intrinsics)
             size = view.intrinsics.height, view.intrinsics.width
-            pixels = np.frombuffer(zstandard.decompress(view.packed), np.uint8)
-            depth, label = pixels[: -size[0] * size[1]], pixels[-size[0] * size[1] :]
-            measured = depth.view(np.float32).reshape(size)[row, column]
+            (depth, packed_depth), (label, packed_label) = view.depth, view.label
+            measured = depth.decode(packed_depth, size, "depth")[row, column]
             visible = inside & (measured > 0) & (np.abs(measured - p[:, 2]) < AGREEMENT_M)
-            channel = self._label_set.to_channels(label.reshape(size))[row, column]
+            channel = self._label_set.to_channels(label.decode(packed_label, size, "label"))[row, column]
             index = np.flatnonzero(visible & (channel != IGNORE_CHANNEL))
             votes[index, channel[index]] += 1
         channel = np.where(votes.any(axis=1), votes.argmax(axis=1), IGNORE_CHANNEL)

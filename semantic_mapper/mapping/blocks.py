@@ -87,6 +87,11 @@ class BlockValues(NamedTuple):
     evidence: UInt16
     votes: Float32
 
+    def take(self, rows: NDArray[Any]) -> BlockValues:
+        """A copy of blocks with these numbers (N,)."""
+        copies: list[Any] = [values[rows] for values in self]
+        return BlockValues(*copies)
+
 
 def empty_blocks(count: int, classes: int) -> BlockValues:
     """Blocks whose voxels are all zero."""
