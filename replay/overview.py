@@ -31,6 +31,7 @@ MAX_POINTS = 2_000_000
 ELEVATION = float(np.deg2rad(42))
 SUPERSAMPLING = 2  # pixels drawn a side for each pixel of the picture
 MAX_SPLAT = 13  # largest side of a splat, drawn pixels
+BAND, MARGIN_ROWS = 256, 24  # rows drawn at a time, and those around that splats and shading reach
 COLUMN_M = 0.12  # side of the upright columns in which walls are looked for
 EDGE_STRENGTH = 1.1  # of the shading
 AZIMUTHS = tuple(float(np.deg2rad(degrees)) for degrees in (35, 55, 125, 145, 215, 235, 305, 325))
@@ -242,11 +243,18 @@ def draw_points(
     scale *= SUPERSAMPLING
     side = int(np.clip(np.ceil(point_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
     pixel = np.floor((xyz_view[:, :2] - centre) * scale + (width / 2, height / 2)).astype(np.int64)
-    nearest = _nearest_points(pixel, xyz_view[:, 2], width, height, side)
-    hit = nearest >= 0
-    depth = xyz_view[:, 2].astype(np.float32)[nearest]
-    shade = _shading(np.where(hit, depth, depth[hit].max(initial=0.0) + np.float32(0.05)), scale)
-    canvas[hit] = np.clip(colors[nearest[hit]] * shade[hit][:, None], 0, 255).astype(np.uint8)
+    z = xyz_view[:, 2].astype(np.float32)
+    inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
+    behind = z[inside].max(initial=0.0) + np.float32(0.05)
+    for top in range(0, height, BAND):  # as a whole it would take some 80 MB
+        first, last = max(0, top - MARGIN_ROWS), min(height, top + BAND + MARGIN_ROWS)
+        nearest = _nearest_points(pixel - (0, first), xyz_view[:, 2], width, last - first, side)
+        hit = nearest >= 0
+        shade = _shading(np.where(hit, z[nearest], behind), scale)
+        own = slice(top - first, top - first + BAND)
+        hit, shade, nearest = hit[own], shade[own], nearest[own]
+        drawn = np.clip(colors[nearest[hit]] * shade[hit][:, None], 0, 255)
+        canvas[top : top + BAND][hit] = drawn.astype(np.uint8)
     return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), scale / SUPERSAMPLING
 
 

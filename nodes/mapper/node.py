@@ -236,6 +236,7 @@ class MapperNode(Closing):
         self._publish_status("ended", now=True)
 
     def _step_of_finish(self) -> None:
+        give_back_freed_memory()  # each step of the ending needs other memory
         self._context.heartbeat.turn()
         self._publish_status("stopping")
 

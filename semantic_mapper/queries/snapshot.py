@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 NEAREST_STEPS = 60  # farther from zero, a voxel is the nearer end of no crossing of the TSDF; as in surface.h
 LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
+_LOOKED_AT_AT_ONCE = 512  # blocks
 
 _deliveries = itertools.count()  # that mirrors of this process have taken over; counting takes no lock
 COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it
@@ -233,11 +234,13 @@ def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int)
     pool.confidence[part] = changes.confidence
     pool.rgb[part] = changes.rgb
     # Classes of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``).
-    label, tsdf = changes.label, changes.tsdf
-    at = np.flatnonzero((label != ignore_id) & changes.observed & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS))
-    has_class = np.zeros((len(tsdf), 256), np.bool_)
-    has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
-    pool.classes[part] = np.packbits(has_class, axis=1, bitorder="little").view("<u8")
+    for first in range(0, len(changes.keys), _LOOKED_AT_AT_ONCE):
+        rows = slice(first, first + _LOOKED_AT_AT_ONCE)
+        label, tsdf = changes.label[rows], changes.tsdf[rows]  # not observed is below -NEAREST_STEPS
+        at = np.flatnonzero((label != ignore_id) & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS))
+        has_class = np.zeros((len(tsdf), 256), np.bool_)
+        has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
+        pool.classes[part][rows] = np.packbits(has_class, axis=1, bitorder="little").view("<u8")
 
 
 def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
