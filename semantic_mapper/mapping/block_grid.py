@@ -258,7 +258,7 @@ class BlockGrid:
         """A copy of blocks (B,) that exist, from memory or disk."""
         found = find_blocks(self._index, packed)
         away = np.flatnonzero(found < 0)
-        values = BlockValues._make(array[found] for array in self._buffers.values)
+        values = self._buffers.values.take(found)
         if len(away):
             for array in values:
                 array[away] = 0

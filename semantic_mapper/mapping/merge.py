@@ -66,11 +66,10 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
         _resample_blocks(
             len(wanted), unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved
         )
-        holds = (moved.weight > 0).any(axis=1)  # votes come with weight
-        if holds.any():
+        holds = np.flatnonzero((moved.weight > 0).any(axis=1))  # votes come with weight
+        if len(holds):
             blocks = target.activate(wanted[holds])
-            added = BlockValues._make(part[holds] for part in moved)
-            _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
+            _add_block_values(len(blocks), blocks, target.buffers(), moved.take(holds), cap)
             target.mark_changed(blocks, version)
 
 
@@ -80,9 +79,8 @@ def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
     for start in range(0, len(packed), MERGED_AT_ONCE):
         part = packed[start : start + MERGED_AT_ONCE]
         values = source.read(part)
-        holds = (values.weight > 0).any(axis=1)
-        part, values = part[holds], BlockValues._make(array[holds] for array in values)
-        target.mark_changed(target.fill(part, values), version)
+        holds = np.flatnonzero((values.weight > 0).any(axis=1))
+        target.mark_changed(target.fill(part[holds], values.take(holds)), version)
 
 
 def overlaps(sources: Int64, T_target_source: VoxelTransform) -> Int64:
