@@ -38,7 +38,7 @@ from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.pose_check import PoseCheck
-from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, upsample
+from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, likeliest, upsample
 from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualView, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, UInt8
@@ -394,9 +394,9 @@ class MappingPipeline:
 
     def _at_rows(self, view: RenderedView, rows: Int32) -> tuple[UInt8, Float32]:
         """Class ids and confidence (H, W) of what the pixels take from a view; row -1 is unknown."""
-        table = view.probabilities.reshape(-1, len(self.label_set))
-        ids = np.append(self.label_set.to_ids(table.argmax(axis=1)), np.uint8(self.label_set.ignore_id))
-        return ids[rows], np.append(table.max(axis=1), np.float32(0))[rows]
+        channel, most = likeliest(view.probabilities)
+        ids = np.append(self.label_set.to_ids(channel.ravel()), np.uint8(self.label_set.ignore_id))
+        return ids[rows], np.append(most, np.float32(0))[rows]
 
     # Besides the stages.
 

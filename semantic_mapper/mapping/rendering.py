@@ -166,7 +166,7 @@ def upsample(
     out = np.full(depth.shape, -1, np.int32)
     if not known.size:
         return out
-    channel = np.ascontiguousarray(np.where(known, probabilities.argmax(axis=2), -1))
+    channel = np.where(known, likeliest(probabilities)[0], -1)
     look = np.dstack((rgb_low.astype(np.float32), depth_low))
     one_class = np.empty(channel.shape, np.bool_)
     find_one_class(len(channel), channel, one_class)
@@ -174,6 +174,21 @@ def upsample(
     images = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
     upsample_view(len(depth), table, channel, one_class, look, *images, out)
     return out
+
+
+def likeliest(probabilities: Float32) -> tuple[Int64, Float32]:
+    """Number of the likeliest class of each pixel (h, w), of (h, w, L), and its probability."""
+    height, width, classes = probabilities.shape
+    channel, most = np.empty((height, width), np.int64), np.empty((height, width), np.float32)
+    likeliest_rows(
+        height * width, np.ascontiguousarray(probabilities).reshape(-1, classes), channel.ravel(), most.ravel()
+    )
+    return channel, most
+
+
+@parallel_kernel()
+def likeliest_rows(count: int, probabilities: Float32, channel: Int64, most: Float32) -> None:
+    """``likeliest`` of ``count`` rows (N, L) into (N,) each."""
 
 
 @parallel_kernel()

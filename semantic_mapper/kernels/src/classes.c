@@ -48,6 +48,24 @@ KERNEL(softmax_rows, SoftmaxArguments) {
 }
 
 typedef struct {
+    F32 probabilities; /* (N, L) */
+    I64 channel;       /* (N,) to fill */
+    F32 most;          /* (N,) to fill */
+} LikeliestArguments;
+
+/* The class of the largest probability of each row, the first of equal ones, and that probability. */
+KERNEL(likeliest_rows, LikeliestArguments) {
+    const int64_t classes = a->probabilities.shape[1];
+    for (int64_t n = start; n < stop; n++) {
+        const float *row = a->probabilities.data + n * classes;
+        int64_t best = 0;
+        for (int64_t c = 1; c < classes; c++) best = row[c] > row[best] ? c : best;
+        a->channel.data[n] = best, a->most.data[n] = row[best];
+    }
+    return 0;
+}
+
+typedef struct {
     F32 own, probabilities; /* (N, L) logits; probabilities, of which those of `known` are replaced */
     U8 known;               /* (N,) bool */
     double weight, floor;   /* of `own`; the least probability that counts */
