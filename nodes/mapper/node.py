@@ -37,7 +37,7 @@ from semantic_mapper.types import MapUpdate, PosedFrame
 
 POLL_S = 0.1
 MAX_AGE_S = 60.0  # of a frame, by its stamp: more, or less than nothing, and its clock is not this machine's
-TRIM_PERIOD_S = 60.0  # a node that runs for hours would otherwise hold more and more of what it has freed
+TRIM_PERIOD_S = 10.0  # a node that runs for hours would otherwise hold more and more of what it has freed
 
 _log = structlog.get_logger(__name__)
 
@@ -231,12 +231,16 @@ class MapperNode(Closing):
             self._queries.hand_over()  # questions are answered while the map is written
         if self._weights is not None:
             self._session.learned = to_builtins(self._weights.end())
-        summary = finish_session(self._session, self._out, self._ended_by, self._resumed, self._step_of_finish)
+        summary = finish_session(self._session, self._out, self._ended_by, self._resumed, self._step_of_results)
         _log.info("map_written", out=str(self._out), **summary["frames"])
         self._publish_status("ended", now=True)
 
+    def _step_of_results(self) -> None:
+        self._pipeline.keyframes.clear()  # no frame comes any more
+        give_back_freed_memory()  # each step needs other memory
+        self._step_of_finish()
+
     def _step_of_finish(self) -> None:
-        give_back_freed_memory()  # each step of the ending needs other memory
         self._context.heartbeat.turn()
         self._publish_status("stopping")
 

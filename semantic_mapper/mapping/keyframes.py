@@ -74,6 +74,10 @@ class KeyframeStore:
         while len(self._keyframes) > self._config.capacity and self._drop_most_redundant():
             pass
 
+    def clear(self) -> None:
+        """Forget all: no frame is to be rendered any more."""
+        self._keyframes = []
+
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> int:
         """Give keyframes other poses, by (camera_id, stamp_ns); what was encoded stays. Returns how many have moved."""
         moved = 0
