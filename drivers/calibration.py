@@ -20,7 +20,16 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent
 
-from semantic_mapper import config
+from semantic_mapper.config import (
+    MAX_FILE_BYTES,
+    AtLeastOne,
+    Config,
+    Positive,
+    check_values,
+    convert_config,
+    read_json,
+    read_toml,
+)
 from semantic_mapper.drivers.lens import ideal_fisheye_view, lens_intrinsics
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import read_regular, write_bytes
@@ -40,15 +49,15 @@ _WANTED = (
 )
 
 
-class CalibrationFile(config.Config, frozen=True):
+class CalibrationFile(Config, frozen=True):
     """A calibration as it stands on disk."""
 
-    fx: config.Positive
-    fy: config.Positive
+    fx: Positive
+    fy: Positive
     cx: float
     cy: float
-    width: config.AtLeastOne
-    height: config.AtLeastOne
+    width: AtLeastOne
+    height: AtLeastOne
     distortion: tuple[float, ...] = ()
     fisheye: bool = False  # the lens is OpenCV's fisheye model, also called equidistant
     T_rig_camera: Matrix | None = None  # of a camera on a rig
@@ -214,8 +223,8 @@ def _intrinsics(lens: CalibrationFile, model: str = "opencv") -> CameraIntrinsic
 
 
 def _load_file(path: Path) -> CalibrationFile:
-    plain = config.read_json(path, dict) if path.suffix.lower() == ".json" else config.read_toml(path)
-    return config.convert_config(plain, CalibrationFile, str(path))
+    plain = read_json(path, dict) if path.suffix.lower() == ".json" else read_toml(path)
+    return convert_config(plain, CalibrationFile, str(path))
 
 
 # What other programs write as YAML: ROS's camera_info (camera_calibration, ``ros2 topic echo``), the same keys in
@@ -273,7 +282,7 @@ def _kalibr(plain: Mapping[str, Any]) -> CameraIntrinsics:
 
 def _load_yaml(path: Path) -> CameraIntrinsics:
     yaml = YAML(typ="safe", pure=True)
-    text = read_regular(path, config.MAX_FILE_BYTES).decode("utf-8-sig")
+    text = read_regular(path, MAX_FILE_BYTES).decode("utf-8-sig")
     text, of_opencv = re.subn(r"\A%YAML:1\.0\s*|!!opencv-matrix", "", text)  # as OpenCV's FileStorage writes it
     if any(isinstance(event, AliasEvent) for event in yaml.parse(text)):  # of these, a short file makes a long one
         raise ConfigError("has aliases (*), which no calibration needs")
@@ -283,7 +292,7 @@ def _load_yaml(path: Path) -> CameraIntrinsics:
     if not documents or not isinstance(documents[0], dict):
         raise ConfigError("holds no calibration")
     values = {str(key): value for key, value in cast("dict[Any, Any]", documents[0]).items()}
-    config.check_values(values, "its values")
+    check_values(values, "its values")
     lowered = {_MESSAGE.get(key.lower(), key.lower()): value for key, value in values.items()}
     if "camera_matrix" not in lowered:
         return _kalibr(values)
