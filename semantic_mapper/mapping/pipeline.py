@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import cv2
@@ -44,6 +45,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, UInt8
 
 _log = get_logger(__name__)
+_aside = ThreadPoolExecutor(1, "aside")  # for a stage that needs one core, while others need both now and then
 
 MAX_CAMERAS = 64  # as in a stream's information; something is kept of each
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
@@ -111,12 +113,15 @@ class MappingPipeline:
             views = FrameViews(self._checked(self.corrector.place(frame)))
             self._stage_ms = {}
             self.pose_check.look(views.frame)
-            current = self._timed("encode", self._encode, views)
-            if self.domain_check is not None:
-                self.domain_check.note()
-            sources = self._timed("choose", self._choose_sources, views, current, self.keyframes)
-            view, votes = self._timed("render", self._render_semantics, views, sources, current)
-            moving = self._timed("motion", self.moving.find, views.frame)
+            finding = _aside.submit(self.moving.find, views.frame)
+            try:
+                current = self._timed("encode", self._encode, views)
+                if self.domain_check is not None:
+                    self.domain_check.note()
+                sources = self._timed("choose", self._choose_sources, views, current, self.keyframes)
+                view, votes = self._timed("render", self._render_semantics, views, sources, current)
+            finally:
+                moving = self._timed("motion", finding.result)
             # From here on without what moves (``full.views``): it is published, but neither fused nor kept.
             full = self._timed("upsample", self._upsample_still, views, votes, moving)
             touched = self._timed("fuse", self._fuse, self.voxel_map, full, votes)
