@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.render import softmax
 from semantic_mapper.mapping.rendering import (
     LEAST_SHARE,
     RateController,
     RenderedView,
     add_own_image,
+    likeliest,
     upsample,
 )
 
@@ -24,6 +26,16 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
     v, u = np.mgrid[0:24, 0:32] // 4
     near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
     assert ((rows == -1) | near).all() and near.mean() > 0.5
+
+
+@pytest.mark.parametrize("classes", [1, 8, 21, 256])
+def test_probabilities_and_the_likeliest_class_are_those_of_numpy(classes: int):
+    logits = np.random.default_rng(classes).normal(0, 20, (5, 7, classes)).astype(np.float32)
+    raised = np.exp(logits.astype(np.float64) - logits.max(axis=2, keepdims=True))
+    found = softmax(logits)
+    np.testing.assert_allclose(found, raised / raised.sum(axis=2, keepdims=True), rtol=2e-5, atol=1e-30)
+    channel, most = likeliest(found)
+    assert np.array_equal(channel, found.argmax(axis=2)) and np.array_equal(most, found.max(axis=2))
 
 
 class Says:
