@@ -5,7 +5,7 @@
 #        times as many points as of TSDF. Of TSDF all lie in one layer, 9.5 mm off. No setting changes it; raycast() of
 #        the same HashTSDF finds 99 % of the wall to 2 cm.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, Python 3.11, Linux x86-64.
-# Who:   whoever takes the cloud of a HashTSDF volume as a map, or scores it against a reference.
+# Who:   users who take the cloud of a HashTSDF volume as a map, or score it against a reference.
 # What to do: keep raycast() of several poses, or cut a mesh out of the distances by other means.
 set -eu
 work=$(mktemp -d)

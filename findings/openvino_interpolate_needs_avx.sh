@@ -5,7 +5,7 @@
 #        compile with both.
 # Seen:  openvino 2026.4.1 and 2026.4.0, Python 3.11, Linux x86-64, with ONEDNN_MAX_CPU_ISA=SSE41 as the stand-in for
 #        Celeron, Pentium and Atom boards without AVX.
-# Who:   whoever runs a segmentation network, which as a rule upsamples, on such a robot's board.
+# Who:   users who run a segmentation network, which as a rule upsamples, on such a robot's board.
 # What to do: upsample by whole factors with DepthToSpace.
 set -eu
 work=$(mktemp -d)

@@ -162,7 +162,7 @@ class FleetComparison(msgspec.Struct, frozen=True):
     operation: str
     metric: str
     lower_is_better: bool
-    a: float | None  # mean over the logs that both have a score of; None = there is none
+    a: float | None  # mean over the logs that both have a score of; None = no such log
     b: float | None
     interval: tuple[float, float] | None  # of the mean difference B - A; None = fewer than two such logs
     logs: tuple[LogChange, ...]  # the worst first

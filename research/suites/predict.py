@@ -28,8 +28,8 @@ class Prediction:
     """A rendered query view.
 
     Args:
-        label: (H, W) uint8 ids of the suite's label set, its ignore id where unknown or where the field's class is none
-            of these.
+        label: (H, W) uint8 ids of the suite's label set, its ignore id where unknown or where the field's class is not
+            among these.
         confidence: (H, W) float32 probability of the field's most likely class.
         rgb: (H, W, 3) float32 in [0, 1].
         depth_m: (H, W) float32.

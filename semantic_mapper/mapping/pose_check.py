@@ -10,7 +10,7 @@ compared, too, and a tenth of the pairs is enough for a warning. What moves is s
 as well: that is taken off. Unnoticed stay depth 20 % too large, a focal length 10 % too long, a drift of 20 cm.
 
 Poses that stand still give no pairs, and pictures may not show one view after the other. A quarter of the parts of a
-still camera's pictures correlate by 0.99, whoever walks before it; in a walk through a kitchen 0.3 after 1.5 s."""
+still camera's pictures correlate by 0.99, also where people walk; in a walk through a kitchen 0.3 after 1.5 s."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
