@@ -65,6 +65,7 @@ def finish_session(
         session.process_rest()
     except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
         _log.error("last_frames_not_mapped", reason=str(error))
+    session.pipeline.release()
     progress()
     out.mkdir(parents=True, exist_ok=True)
     clear_results(out)

@@ -236,7 +236,6 @@ class MapperNode(Closing):
         self._publish_status("ended", now=True)
 
     def _step_of_results(self) -> None:
-        self._pipeline.keyframes.clear()  # no frame comes any more
         give_back_freed_memory()  # each step needs other memory
         self._step_of_finish()
 

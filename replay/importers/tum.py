@@ -19,10 +19,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import interpolate_pose, pose_matrix
+from semantic_mapper.geometry import interpolate_pose, nearest_pose, pose_matrix
 from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import MATCH_NS, BadFrameError, DepthScale, ImportOptions
 from semantic_mapper.replay.importers.folder import read_intrinsics
@@ -70,7 +69,8 @@ def open_tum(folder: Path, options: ImportOptions) -> PosedPictures:
         )
     intrinsics, depth_scale, scale_from = _intrinsics(folder, notices)
     T_marker_camera = _T_M.copy()
-    T_marker_camera[:3, :3] = Rotation.from_matrix(_T_M[:3, :3] / _ENLARGED).as_matrix()  # of few digits
+    T_marker_camera[:3, :3] /= _ENLARGED
+    T_marker_camera = nearest_pose(T_marker_camera)  # it is of few digits
     color = _read_list(folder / "rgb.txt", notices)
     if not color:
         raise ImportSourceError("; ".join((f"{folder / 'rgb.txt'}: holds no line 'stamp file'", *notices[-1:])))

@@ -136,6 +136,9 @@ class FrameLabels:
         depth = rays.prior_depth_m
         return Rendered(logits, depth, (depth > 0).astype(np.float32), np.zeros((len(label), 3), np.float32), known)
 
+    def release(self) -> None:
+        """Nothing: it holds nothing."""
+
     def source_logits(self, sources: NoView) -> None:
         """No opinion."""
 

@@ -110,6 +110,10 @@ class StreamField(Protocol[EncodedT]):
         """Logits (h, w, L) of an encoded view by itself; None where the field has no opinion of single images."""
         ...
 
+    def release(self) -> None:
+        """Give up what ``encode`` made to be fast, and makes again the next time."""
+        ...
+
 
 def check_classes(field: StreamField[Any], label_set: LabelSet) -> None:
     """Refuse a field for a map of other classes. Raises WeightsError: naming both."""

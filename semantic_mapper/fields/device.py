@@ -161,6 +161,9 @@ class DeviceField:
             logits = self.model.source_logits(sources)
             return None if logits is None else logits[0].permute(1, 2, 0).float().cpu().numpy()
 
+    def release(self) -> None:
+        """Nothing: it holds no more than its weights."""
+
     def render(self, rays: Rays, sources: EncodedViews) -> Rendered:
         """Render rays from views that ``encode`` has encoded."""
         near, far = (torch.full((len(rays.origin),), bound) for bound in (rays.near_m, rays.far_m))

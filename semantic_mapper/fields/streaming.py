@@ -1,7 +1,7 @@
 """S-Ray for streaming: the weights and the answer of ``SRay``, by OpenVINO and a compiled kernel on the CPU."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -80,6 +80,8 @@ class StreamingSRay:
         if others := [n for n in tensors if n not in read.names and not n.endswith(".num_batches_tracked")]:
             raise WeightsError(f"weights do not fit their model config: it has no '{others[0]}'")
         self._tensors = tensors
+        self._classifier = _Layer(tensors["classifier.weight"].T, tensors["classifier.bias"])
+        self._label_logit: Float32 = tensors["label_logit"]
         self._networks: dict[tuple[int, int, bool], ImageNetwork] = like._networks if like else {}
         at_surface = config.tokens == "surface"
         self._settings = _Settings(config.heads, at_surface, numbers.COLOUR_SCALE if at_surface else 0.0)
@@ -134,7 +136,11 @@ class StreamingSRay:
         s, weights = sources.feature[0], self._weights
         hidden = np.maximum(s @ weights.semantic_hidden.weight + weights.semantic_hidden.bias, 0)
         s = s + hidden @ weights.semantic_out.weight + weights.semantic_out.bias
-        return s @ self._tensors["classifier.weight"].T + self._tensors["classifier.bias"]
+        return s @ self._classifier.weight + self._classifier.bias
+
+    def release(self) -> None:
+        """Give up the compiled networks."""
+        self._networks.clear()
 
     def render(self, rays: Rays, sources: StreamedViews) -> Rendered:
         """Render rays with guided samples."""
@@ -165,9 +171,9 @@ class StreamingSRay:
             self._weights,
             _Rendered(rendered, colour, depth, opacity, known, carried),
         )
-        weight, bias = self._tensors["classifier.weight"], self._tensors["classifier.bias"]
-        total = np.float32(1) if self._settings.at_surface else opacity[:, None]
-        logits = rendered @ weight.T + total * bias + self._tensors["label_logit"] * carried
+        weight, bias = self._classifier
+        offset = bias if self._settings.at_surface else opacity[:, None] * bias
+        logits = rendered @ weight + offset + self._label_logit * carried
         return Rendered(logits * known[:, None], depth, opacity, colour, known)
 
     def _network(self, height: int, width: int, with_depth: bool) -> ImageNetwork:
@@ -177,16 +183,22 @@ class StreamingSRay:
         return self._networks[key]
 
 
-class _Read(dict[str, NDArray[Any]]):
+class _Read(Mapping[str, NDArray[Any]]):
     """Tensors, and the ``names`` of those that were read."""
 
     def __init__(self, tensors: Tensors) -> None:
-        super().__init__(tensors)
+        self._tensors = tensors
         self.names: set[str] = set()
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         self.names.add(name)
-        return super().__getitem__(name)
+        return self._tensors[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tensors)
+
+    def __len__(self) -> int:
+        return len(self._tensors)
 
 
 class _Rays(NamedTuple):

@@ -11,7 +11,7 @@ with depth, labels and pose. They are source views of every later render in the 
 # safetensors leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -147,10 +147,26 @@ def load_weights(path: Path) -> WeightsFile:
 
 def as_float32(tensors: Tensors, path: Path) -> Tensors:
     """Tensors of a file as networks take them. Raises WeightsError: they hold NaN."""
-    found = {n: t if t.dtype != np.float16 else t.astype(np.float32) for n, t in tensors.items()}
-    if not all(np.isfinite(t).all() for t in found.values()):
+    if not all(np.isfinite(t).all() for t in tensors.values()):
         raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
-    return found
+    return _Widened(tensors)
+
+
+class _Widened(Mapping[str, NDArray[Any]]):
+    """Tensors as they are stored, of which those of 16 bits are read as float32: networks copy what they take."""
+
+    def __init__(self, stored: Tensors) -> None:
+        self._stored = stored
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        tensor = self._stored[name]
+        return tensor.astype(np.float32) if tensor.dtype == np.float16 else tensor
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._stored)
+
+    def __len__(self) -> int:
+        return len(self._stored)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # loads `spatial` when it is first used
 
 from semantic_mapper.geometry import (
     invert_pose,
@@ -440,7 +440,7 @@ def agreed(agreeing: Sequence[Sighting]) -> Float64:
     for _ in range(_FIT_ROUNDS):
         w = np.repeat(weights / weights.sum() / len(_LOOKED_AT), len(_LOOKED_AT))
         a, b = w @ old, w @ new
-        T[:3, :3] = Rotation.align_vectors(new - b, old - a, w)[0].as_matrix()
+        T[:3, :3] = scipy.spatial.transform.Rotation.align_vectors(new - b, old - a, w)[0].as_matrix()
         T[:3, 3] = b - T[:3, :3] @ a
         off = np.linalg.norm(transform(T, old) - new, axis=1).reshape(len(agreeing), -1)
         weights = 1 / (1 + (off**2).mean(axis=1) / _SPREAD_M**2)

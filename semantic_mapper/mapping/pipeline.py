@@ -178,6 +178,11 @@ class MappingPipeline:
         self.domain_check = None  # they were fitted to this place
         self.keyframes.exchange_labelled(anchors)
 
+    def release(self) -> None:
+        """Forget keyframes and what encodes them, where no frame is to come: some 60 MB."""
+        self.keyframes.clear()
+        self.field.release()
+
     def agreement(self, frame: PosedFrame, renderer: ViewRenderer, keyframes: KeyframeStore) -> tuple[int, int]:
         """Pixels of a mapped frame that another field, rendering from ``keyframes``, names as the map does, and pixels
         compared: those that the map is sure of. Changes nothing; the field encodes as the present one does."""

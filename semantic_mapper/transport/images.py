@@ -102,7 +102,7 @@ def zstd_compress(data: Buffer) -> bytes:
     compressor: zstandard.ZstdCompressor | None = getattr(_thread, "compressor", None)
     if compressor is None:
         compressor = _thread.compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL, write_content_size=True)
-    return compressor.compress(data)
+    return bytes(memoryview(compressor.compress(data)))  # a copy: what it gives holds room for incompressible data
 
 
 def zstd_decompress(data: Buffer, size: int, what: str) -> bytes:

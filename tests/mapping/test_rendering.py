@@ -44,6 +44,9 @@ class Says:
     def __init__(self, logits: np.ndarray | None) -> None:
         self.logits = logits
 
+    def release(self):
+        raise NotImplementedError
+
     def source_logits(self, sources):
         return self.logits
 
