@@ -174,7 +174,8 @@ class StreamingSRay:
         weight, bias = self._classifier
         offset = bias if self._settings.at_surface else opacity[:, None] * bias
         logits = rendered @ weight + offset + self._label_logit * carried
-        return Rendered(logits * known[:, None], depth, opacity, colour, known)
+        logits *= known[:, None]
+        return Rendered(logits, depth, opacity, colour, known)
 
     def _network(self, height: int, width: int, with_depth: bool) -> ImageNetwork:
         key = height, width, with_depth
