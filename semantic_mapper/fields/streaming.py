@@ -173,7 +173,7 @@ class StreamingSRay:
         )
         weight, bias = self._classifier
         offset = bias if self._settings.at_surface else opacity[:, None] * bias
-        logits = rendered @ weight + offset + self._label_logit * carried
+        logits = np.asarray(rendered @ weight + offset + self._label_logit * carried, np.float32)
         logits *= known[:, None]
         return Rendered(logits, depth, opacity, colour, known)
 
