@@ -5,8 +5,9 @@
 #include "camera.h"
 #include "grid_buffers.h"
 
-#define TILE 4  /* pixels a side of the largest tiles that one ray may stand for; the smaller ones have 2 and 1 */
-#define TRAIL 8 /* blocks of the ray before that are kept in mind: most are the same again */
+#define TILE 8   /* pixels a side of the largest tiles that one ray may stand for; the smaller ones have 4, 2 and 1 */
+#define LEVELS 4 /* of tiles */
+#define TRAIL 8  /* blocks of the ray before that are kept in mind: most are the same again */
 
 /* The blocks of one band of the image. */
 typedef struct {
@@ -24,7 +25,7 @@ typedef struct {
     double per_block;   /* blocks a metre */
     float depth_max;    /* metres */
     float flat;         /* most that the depths of a tile may differ by, metres */
-    float farthest[3];  /* depth from which on a tile of 1, 2, 4 pixels is too wide */
+    float farthest[LEVELS]; /* depth from which on a tile of 1 << level pixels is too wide */
 } View;
 
 static void remember(KeySet *set, int64_t at, int64_t key) {
@@ -89,39 +90,42 @@ static bool is_smooth(const View *view, int level, float least, float most) {
     return least > 0 && most - least <= view->flat && most <= view->farthest[level];
 }
 
-/* A tile of 4 x 4 pixels: its own ray where it is smooth, else those of its quarters, else those of their pixels. A
- * smooth tile is at most two voxels wide and deep. A block that none of the rays meets has then no more than a corner,
- * less than a voxel wide, between two of them: a few of a thousand blocks, often far from the surface. */
-static void remember_tiles(KeySet *set, const View *view, int64_t u0, int64_t v0) {
-    float z[TILE][TILE], least[4], most[4]; /* least and most: of the quarters */
+/* Least and greatest depth of the tiles of a square of TILE x TILE pixels, by level: those of 1 << level pixels a side. */
+typedef struct {
+    float least[LEVELS][TILE][TILE], most[LEVELS][TILE][TILE];
+} Tiles;
+
+static void bound_tiles(const View *view, int64_t u0, int64_t v0, Tiles *tiles) {
     for (int64_t v = 0; v < TILE; v++)
         for (int64_t u = 0; u < TILE; u++) {
             bool inside = v0 + v < view->height && u0 + u < view->width;
             float value = inside ? view->depth[(v0 + v) * view->width + u0 + u] : 0.0f;
-            z[v][u] = value > 0 && value <= view->depth_max ? value : 0.0f; /* NaN becomes 0, too */
+            tiles->least[0][v][u] = value > 0 && value <= view->depth_max ? value : 0.0f; /* NaN becomes 0, too */
+            tiles->most[0][v][u] = tiles->least[0][v][u];
         }
-    for (int quarter = 0; quarter < 4; quarter++) {
-        int v = quarter & 2, u = (quarter & 1) * 2;
-        least[quarter] = min_f(min_f(z[v][u], z[v][u + 1]), min_f(z[v + 1][u], z[v + 1][u + 1]));
-        most[quarter] = max_f(max_f(z[v][u], z[v][u + 1]), max_f(z[v + 1][u], z[v + 1][u + 1]));
-    }
-    float low = min_f(min_f(least[0], least[1]), min_f(least[2], least[3]));
-    float high = max_f(max_f(most[0], most[1]), max_f(most[2], most[3]));
-    if (is_smooth(view, 2, low, high)) {
-        remember_tile(set, view, u0, v0, TILE, low, high);
+    for (int level = 1; level < LEVELS; level++)
+        for (int v = 0; v < TILE >> level; v++)
+            for (int u = 0; u < TILE >> level; u++) {
+                float(*low)[TILE] = tiles->least[level - 1] + 2 * v, (*high)[TILE] = tiles->most[level - 1] + 2 * v;
+                int x = 2 * u, next = x + 1;
+                tiles->least[level][v][u] = min_f(min_f(low[0][x], low[0][next]), min_f(low[1][x], low[1][next]));
+                tiles->most[level][v][u] = max_f(max_f(high[0][x], high[0][next]), max_f(high[1][x], high[1][next]));
+            }
+}
+
+/* Tile (v, u) of a level: its own ray where it is smooth, else those of its quarters. A smooth tile is at most two
+ * voxels wide and deep. A block that none of the rays meets has then no more than a corner, less than a voxel wide,
+ * between two of them: a few of a thousand blocks, often far from the surface. */
+static void remember_tiles(KeySet *set, const View *view, const Tiles *tiles, int64_t u0, int64_t v0, int level, int v,
+                           int u) {
+    float least = tiles->least[level][v][u], most = tiles->most[level][v][u];
+    if (most <= 0) return;
+    if (is_smooth(view, level, least, most)) {
+        remember_tile(set, view, u0 + (u << level), v0 + (v << level), 1 << level, least, most);
         return;
     }
-    for (int quarter = 0; quarter < 4; quarter++) {
-        int v = quarter & 2, u = (quarter & 1) * 2;
-        if (is_smooth(view, 1, least[quarter], most[quarter])) {
-            remember_tile(set, view, u0 + u, v0 + v, 2, least[quarter], most[quarter]);
-            continue;
-        }
-        for (int pixel = 0; pixel < 4; pixel++) {
-            int y = v + (pixel >> 1), x = u + (pixel & 1);
-            if (is_smooth(view, 0, z[y][x], z[y][x])) remember_tile(set, view, u0 + x, v0 + y, 1, z[y][x], z[y][x]);
-        }
-    }
+    for (int quarter = 0; quarter < 4 && level > 0; quarter++)
+        remember_tiles(set, view, tiles, u0, v0, level - 1, 2 * v + (quarter >> 1), 2 * u + (quarter & 1));
 }
 
 typedef struct {
@@ -151,7 +155,7 @@ KERNEL(collect_block_keys, CollectArguments) {
     };
     memcpy(view.R, camera->R.data, sizeof view.R);
     memcpy(view.t, camera->t.data, sizeof view.t);
-    for (int level = 1; level < 3; level++)
+    for (int level = 1; level < LEVELS; level++)
         view.farthest[level] = (float)(2 * a->voxel * min_d(camera->fx, camera->fy) / (1 << level));
     int64_t bands = a->counts.shape[0], strips = (view.height + TILE - 1) / TILE, capacity = a->keys.shape[1];
     for (int64_t band = start; band < stop; band++) {
@@ -159,8 +163,11 @@ KERNEL(collect_block_keys, CollectArguments) {
                       a->keys.data + band * capacity, capacity, 0, {0}};
         for (int at = 0; at < TRAIL; at++) set.trail[at] = EMPTY_KEY;
         for (int64_t strip = band * strips / bands; strip < (band + 1) * strips / bands; strip++)
-            for (int64_t u = 0; u < view.width && set.count <= capacity; u += TILE)
-                remember_tiles(&set, &view, u, strip * TILE);
+            for (int64_t u = 0; u < view.width && set.count <= capacity; u += TILE) {
+                Tiles tiles;
+                bound_tiles(&view, u, strip * TILE, &tiles);
+                remember_tiles(&set, &view, &tiles, u, strip * TILE, LEVELS - 1, 0, 0);
+            }
         a->counts.data[band] = set.count;
     }
     return 0;
