@@ -93,10 +93,15 @@ def vdbfusion(setup: Setup) -> Peer:
 
 def octomap(setup: Setup) -> Peer:
     """Rays to each voxel with a measurement (``discretize``); its points are centres of occupied voxels."""
-    tree = import_module("pyoctomap").OcTree(setup.voxel_size_m)
+    size_m = setup.voxel_size_m
+    tree = import_module("pyoctomap").OcTree(size_m)
     options = -1.0, False, True  # no limit of range, inner nodes at once, discretize
-    prepare = partial(_world_points, setup)
-    return Peer(lambda given: tree.insertPointCloud(*given, *options), lambda: tree.extractPointCloud()[0], prepare)
+
+    def centres() -> Any:
+        # pyoctomap 1.2.2 gives the upper corner of a voxel, and the centre of one within merged leaves.
+        return (np.ceil(tree.extractPointCloud()[0] / size_m - 0.25) - 0.5) * size_m
+
+    return Peer(lambda given: tree.insertPointCloud(*given, *options), centres, partial(_world_points, setup))
 
 
 def small_gicp(setup: Setup) -> Peer:

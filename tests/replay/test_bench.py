@@ -9,6 +9,7 @@ from semantic_mapper.config import MapperConfig, VoxelMapConfig, with_quality
 from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
 from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.peers.comparison import compare_peers, drift, write_peers
+from semantic_mapper.replay.peers.worker import Frame, Setup, octomap
 from semantic_mapper.types import CameraIntrinsics
 from tests.contract.golden import form, undocumented
 from tests.drawn_room import truth_of, walk_frames
@@ -45,6 +46,19 @@ def test_peers_are_measured_on_the_same_frames_and_one_that_is_absent_names_what
     assert "vdbfusion" in absent["problem"] and "uv pip install" in absent["install"]
     write_peers(tmp_path, found)
     assert (tmp_path / "peers.png").stat().st_size > 1000
+
+
+def test_points_of_octomap_lie_at_the_centres_of_its_voxels() -> None:
+    pytest.importorskip("pyoctomap", reason="the extra `peers`")
+    setup = Setup(30.0, 30.0, 15.5, 11.5, 32, 24, voxel_size_m=0.05, truncation_m=0.2, depth_max_m=5.0)
+    wall = np.full((24, 32), 1.02, np.float32)  # within the voxels from 1.00 to 1.05 m
+    mapper = octomap(setup)
+    assert mapper.points is not None
+    mapper.add(mapper.prepare(Frame(0, np.zeros((24, 32, 3), np.uint8), wall, np.eye(4))))
+    points = np.asarray(mapper.points())
+    assert len(points) > 50 and points[:, 2] == pytest.approx(1.025, abs=1e-6)
+    assert points / 0.05 - 0.5 == pytest.approx(np.round(points / 0.05 - 0.5), abs=1e-4)
+    assert np.abs(points[:, :2].mean(0)).max() < 0.005  # as the wall does, they lie round the axis
 
 
 def test_drift_is_the_error_of_motions_and_of_aligned_positions() -> None:
