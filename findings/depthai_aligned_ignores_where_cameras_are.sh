@@ -3,7 +3,7 @@
 #        may be laid over depth: two cameras at different places are not aligned.
 # Found: places and directions do not count. Two cameras of the same intrinsics and size are "aligned" when they are 2 m
 #        apart or look 30 degrees apart, although the poses are there: by the same objects a point at 1 m lies 45 pixels
-#        apart in a rectified pair of 7.5 cm. isEqualTransformation beside it does compare the poses.
+#        apart in a rectified pair of 7.5 cm. isEqualTransformation does compare the poses.
 # Seen:  depthai 3.12.0, Python 3.11, Linux x86-64, without a device.
 # Who:   users who ask it before they lay colour over depth: rectified pairs have equal intrinsics.
 # What to do: ask isEqualTransformation, or compare getExtrinsicsTransformationMatrixTo with the identity as well.

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Guess: ImgTransformation's project3DPointTo takes its point in millimetres, as spatial detections give them and as
-#        projectPointTo beside it takes its depth; or in the unit of the extrinsics that were set.
+# Guess: ImgTransformation's project3DPointTo takes its point in millimetres, as spatial detections are given and as
+#        projectPointTo takes its depth; or in the unit of the extrinsics that were set.
 # Found: it takes centimetres, whatever the unit of the extrinsics. A point in mm is moved between two cameras as if it were
 #        ten times as far: at 1 m, of a pair 7.5 cm apart with f 600, 4.5 px instead of 45. remap3DPointTo is the same.
 #        A point in metres is off by 100 times the other way. No error: in one picture alone the unit cancels.

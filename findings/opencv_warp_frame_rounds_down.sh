@@ -3,7 +3,7 @@
 # Found: it cuts the fraction off. A shift of 0.9 pixels moves nothing, one of -0.1 moves the whole picture by one: half a
 #        pixel off on average. The identity suffers where the way there and back ends a hair below a whole number: with f
 #        300 and the centre at (159.5, 119.5) 9 % of the pixels stay and 37 % take their right neighbour's value; with
-#        float64 depth of 3.3 m and the centre at (160, 120) 17 % become holes. registerDepth beside it rounds.
+#        float64 depth of 3.3 m and the centre at (160, 120) 17 % become holes. registerDepth rounds.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, Python 3.11, Linux x86-64.
 # Who:   users who check a pose or an odometry by the picture that warpFrame predicts.
 # What to do: add half a pixel to the centre of the camera matrix by which it projects, or warp with remap.
