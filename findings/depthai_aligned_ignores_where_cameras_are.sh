@@ -1,6 +1,6 @@
 #!/bin/sh
-# Guess: ImgTransformation.isAlignedTo of DepthAI says whether pixels of two pictures show the same thing, so that colour
-#        may be laid over depth: two cameras at different places are not aligned.
+# Guess: ImgTransformation.isAlignedTo of DepthAI says whether pixels of two pictures show the same thing, so that
+#        colour may be laid over depth: two cameras at different places are not aligned.
 # Found: places and directions do not count. Two cameras of the same intrinsics and size are "aligned" when they are 2 m
 #        apart or look 30 degrees apart, although the poses are there: by the same objects a point at 1 m lies 45 pixels
 #        apart in a rectified pair of 7.5 cm. isEqualTransformation does compare the poses.
@@ -34,7 +34,10 @@ def camera(x_cm=0.0, turned_deg=0.0, focal_px=600.0):
 
 here = camera()
 others = {
-    "same": camera(), "7.5 cm apart": camera(7.5), "2 m apart": camera(200), "turned by 30 degrees": camera(0, 30),
+    "same": camera(),
+    "7.5 cm apart": camera(7.5),
+    "2 m apart": camera(200),
+    "turned by 30 degrees": camera(0, 30),
     "other focal length": camera(focal_px=500),
 }
 found = {name: (here.isAlignedTo(other), here.isEqualTransformation(other)) for name, other in others.items()}

@@ -1,10 +1,10 @@
 #!/bin/sh
-# Guess: erode and dilate of OpenCV, over a float depth image with NaN where depth is missing, either leave NaN out or spread
-#        it over the window; the place itself stays NaN or is filled.
-# Found: of float32 the NaN moves. With a window of 3x3 a single missing pixel is NaN one pixel to the left and one up or
-#        down, by whether its row is even, and nowhere else; with 5x5 two to the left and two up or down. The missing pixel
-#        itself gets a value. Of float64 it vanishes at three places of four, by row and column even or odd, and becomes a
-#        square of 2x2 at the fourth. So a mask of what is missing no longer fits. No error, no warning.
+# Guess: erode and dilate of OpenCV, over a float depth image with NaN where depth is missing, either leave NaN out or
+#        spread it over the window; the place itself stays NaN or is filled.
+# Found: of float32 the NaN moves. With a window of 3x3 a single missing pixel is NaN one pixel to the left and one up
+#        or down, by whether its row is even, and nowhere else; with 5x5 two to the left and two up or down. The missing
+#        pixel itself gets a value. Of float64 it vanishes at three places of four, by row and column even or odd, and
+#        becomes a square of 2x2 at the fourth. So a mask of what is missing no longer fits. No error, no warning.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, Python 3.11, Linux x86-64, with and without AVX2.
 # Who:   users who grow or clean edges of a depth image whose missing values are NaN, as rescaleDepth gives them.
 # What to do: take the mask first, put +inf (before erode) or 0 (before dilate) there, and apply the mask afterwards.
@@ -32,13 +32,17 @@ def nan_at(change, kind, side):
 
 
 cases = [(kind, side) for kind in (np.float32, np.float64) for side in (3, 5)]
-found = {(kind.__name__, side): [nan_at(change, kind, side) for change in (cv2.erode, cv2.dilate)] for kind, side in cases}
+found = {
+    (kind.__name__, side): [nan_at(change, kind, side) for change in (cv2.erode, cv2.dilate)] for kind, side in cases
+}
 for case, of_both in found.items():
     print(case, *of_both, sep="\n    ")
 square = [[(0, 0), (0, 1), (1, 0), (1, 1)], [(1, 1), (1, 2), (2, 1), (2, 2)]]
 expected = {
-    ("float32", 3): [[(-1, -1)]] * 2 + [[(1, -1)]] * 2, ("float32", 5): [[(2, -2)]] * 2 + [[(-2, -2)]] * 2,
-    ("float64", 3): [square[0], [], [], []], ("float64", 5): [[], [], [], square[1]],
+    ("float32", 3): [[(-1, -1)]] * 2 + [[(1, -1)]] * 2,
+    ("float32", 5): [[(2, -2)]] * 2 + [[(-2, -2)]] * 2,
+    ("float64", 3): [square[0], [], [], []],
+    ("float64", 5): [[], [], [], square[1]],
 }
 sys.exit(any(found[case] != [places, places] for case, places in expected.items()))
 PY

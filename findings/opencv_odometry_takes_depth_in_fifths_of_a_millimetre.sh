@@ -1,9 +1,9 @@
 #!/bin/sh
-# Guess: Odometry of OpenCV 5 takes a depth image of 16 bits in millimetres, as depthTo3d, registerDepth and rescaleDepth of
-#        the same module do; or it has a setting for the unit.
-# Found: it divides by 5,000, the unit of TUM's recordings. A camera that moves 30 mm to the right and 50 mm ahead is said to
-#        have moved 6 and 10 mm; rotations are right, compute() says true. OdometrySettings has no unit to set. The same
-#        depth in float metres is right.
+# Guess: Odometry of OpenCV 5 takes a depth image of 16 bits in millimetres, as depthTo3d, registerDepth and
+#        rescaleDepth of the same module do; or it has a setting for the unit.
+# Found: it divides by 5,000, the unit of TUM's recordings. A camera that moves 30 mm to the right and 50 mm ahead is
+#        said to have moved 6 and 10 mm; rotations are right, compute() says true. OdometrySettings has no unit to set.
+#        The same depth in float metres is right.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, Python 3.11, Linux x86-64; types DEPTH and RGB_DEPTH.
 # Who:   users who hand it the images of a Kinect, RealSense or OAK as they are: a trajectory five times too short.
 # What to do: hand it rescaleDepth's float metres.
@@ -53,7 +53,11 @@ def millimetres(depth_m):
     return np.round(depth_m * 1000).astype(np.uint16)
 
 
-print("true:", t * 1000, f"mm, {np.degrees(0.02):.3f} degrees; the wall by depthTo3d {cv2.depthTo3d(millimetres(before[0]), K)[100, 200, 2]:.3f} m")
+print(
+    "true:",
+    t * 1000,
+    f"mm, {np.degrees(0.02):.3f} deg; wall by depthTo3d {cv2.depthTo3d(millimetres(before[0]), K)[100, 200, 2]:.3f} m",
+)
 found = {}
 for name in ("DEPTH", "RGB_DEPTH"):
     for unit, as_depth in (("float metres", lambda depth: depth), ("16 bits, mm", millimetres)):
@@ -62,7 +66,8 @@ for name in ("DEPTH", "RGB_DEPTH"):
 units = [method for method in dir(cv2.OdometrySettings) if "factor" in method.lower() or "unit" in method.lower()]
 sideways = {key: moved[0] for key, moved in found.items()}
 sys.exit(
-    bool(units) or any(abs(sideways[name, "float metres"] - 30) > 1.5 for name in ("DEPTH", "RGB_DEPTH"))
+    bool(units)
+    or any(abs(sideways[name, "float metres"] - 30) > 1.5 for name in ("DEPTH", "RGB_DEPTH"))
     or any(abs(sideways[name, "16 bits, mm"] - 6) > 0.3 for name in ("DEPTH", "RGB_DEPTH"))
 )
 PY

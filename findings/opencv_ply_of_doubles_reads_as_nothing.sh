@@ -1,10 +1,10 @@
 #!/bin/sh
-# Guess: loadPointCloud of OpenCV 5 reads a PLY file whose coordinates are doubles, as plyfile, NumPy users and Open3D write
-#        them; or it throws an error, as its documentation says of a cloud that cannot be read.
-# Found: it gives (None, None, None) and goes on; loadMesh the same of a mesh. Only the log has a line ("should be float").
-#        The same file in floats is read. What OpenCV wrote from colours of 8 bits is odd as well: savePointCloud
-#        multiplies them by 255, so that a property of type uchar holds 65025, which plyfile refuses and which OpenCV reads
-#        back as 1 of 255.
+# Guess: loadPointCloud of OpenCV 5 reads a PLY file whose coordinates are doubles, as plyfile, NumPy users and Open3D
+#        write them; or it throws an error, as its documentation says of a cloud that cannot be read.
+# Found: it gives (None, None, None) and goes on; loadMesh the same of a mesh. Only the log has a line ("should be
+#        float"). The same file in floats is read. What OpenCV wrote from colours of 8 bits is odd as well:
+#        savePointCloud multiplies them by 255, so that a property of type uchar holds 65025, which plyfile refuses and
+#        which OpenCV reads back as 1 of 255.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, plyfile 1.1.5, Python 3.11, Linux x86-64.
 # Who:   users who read clouds of other programs, and see "no points" where a file is wrong for OpenCV alone.
 # What to do: check the result for None; convert to float32 first, and hand over colours as floats of 0 to 1.
@@ -46,7 +46,11 @@ except (PlyParseError, OverflowError, ValueError) as error:
 back = cv2.loadPointCloud(path)[2].reshape(-1, 3)[0] * 255
 print(f"red 255 is written as {written} in a uchar: {declared}; plyfile: {refused!r}; OpenCV reads {back}")
 sys.exit(
-    read["f4"] != [3, 3] or read["f8"] != [None, None] or not declared or written != "65025" or not refused
+    read["f4"] != [3, 3]
+    or read["f8"] != [None, None]
+    or not declared
+    or written != "65025"
+    or not refused
     or round(float(back[0])) != 1
 )
 PY

@@ -32,7 +32,9 @@ for far_m in (0, 10, 1000):
     of_inverses = pycolmap.Rigid3d.interpolate(first, last, 0.5)
     off, right = (np.linalg.norm(pose.translation - place) for pose in (between, of_inverses))
     turned = np.degrees(between.rotation.angle())
-    print(f"{far_m} m from the origin: {off:.3f} m off, turned by {turned:.1f} degrees; of the inverses {right:.3f} m off")
+    print(
+        f"{far_m} m from the origin: {off:.3f} m off, turned by {turned:.1f} degrees; of the inverses {right:.3f} m off"
+    )
     wrong |= abs(off - far_m * (1 - np.cos(np.pi / 6))) > 1e-6 or right > 1e-9 or abs(turned - 30) > 1e-6
 sys.exit(bool(wrong))
 PY

@@ -1,11 +1,12 @@
 #!/bin/sh
 # Guess: extractPointCloud() of pyoctomap gives the centres of the occupied and of the free voxels.
-# Found: the point of a leaf of the finest level lies at the voxel's upper corner: half a voxel off along x, y and z, 87 mm
-#        in all for voxels of 10 cm. Leaves that were merged are divided into points at the right centres, so that one
-#        cloud has both kinds. getCoordinate() of the leaves is right. ColorOcTree has the same shift.
+# Found: the point of a leaf of the finest level lies at the voxel's upper corner: half a voxel off along x, y and z, 87
+#        mm in all for voxels of 10 cm. Leaves that were merged are divided into points at the right centres, so that
+#        one cloud has both kinds. getCoordinate() of the leaves is right. ColorOcTree has the same shift.
 # Seen:  pyoctomap 1.2.2, Python 3.11, Linux x86-64.
 # Who:   users who score or fuse an OctoMap by its points: a map is half a voxel from where it was measured.
-# What to do: take the leaves' getCoordinate(), or round the points down to their voxel.
+# What to do: take the leaves' getCoordinate(), or the voxel that holds a point less a quarter of a voxel along each
+#        axis.
 set -eu
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -1,10 +1,11 @@
 #!/bin/sh
 # Guess: RealSense's syncer pairs depth and colour of a software device by the difference of their stamps, against the
 #        frame rate that the streams declare; at which time the recording began does not matter.
-# Found: without a rate from a camera the device invents one: frame number divided by stamp. A steady stream of 30 frames a
-#        second whose stamps begin at 0 "runs" at 60, 45, 40, 37.5; begun at 1 s, at 1.0, 1.9, 2.8. The syncer goes by it:
-#        of 20 frames of depth, each 5 ms before its colour, 19 come as pairs when the stamps begin at 0, none when they
-#        begin at 1 s or 10 s (all 40 frames come alone), and 19 again in Unix time, where no rate is set.
+# Found: without a rate from a camera the device invents one: frame number divided by stamp. A steady stream of 30
+#        frames a second whose stamps begin at 0 "runs" at 60, 45, 40, 37.5; begun at 1 s, at 1.0, 1.9, 2.8. The syncer
+#        goes by it: of 20 frames of depth, each 5 ms before its colour, 19 come as pairs when the stamps begin at 0,
+#        none when they begin at 1 s or 10 s (all 40 frames come alone), and 19 again in Unix time, where no rate is
+#        set.
 # Seen:  pyrealsense2 2.59.1.11053, Python 3.11, Linux x86-64.
 # Who:   users who replay recordings of other cameras, or test their own code, through software_device.
 # What to do: pair by stamps oneself; or number the frames by their time: round(stamp_ms * rate / 1000).
@@ -24,7 +25,15 @@ kept = []  # pixels, which the frames only point to
 
 def stream(sensor, kind, pixel, bytes_, number):
     made = rs.video_stream()
-    made.type, made.uid, made.width, made.height, made.fps, made.bpp, made.fmt = kind, number, WIDTH, HEIGHT, RATE, bytes_, pixel
+    made.type, made.uid, made.width, made.height, made.fps, made.bpp, made.fmt = (
+        kind,
+        number,
+        WIDTH,
+        HEIGHT,
+        RATE,
+        bytes_,
+        pixel,
+    )
     lens = rs.intrinsics()
     lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = WIDTH, HEIGHT, 50, 50, WIDTH / 2, HEIGHT / 2
     made.intrinsics = lens
@@ -80,7 +89,9 @@ numbered = replay(10_000, by_time=True)
 print("begin in ms: pairs of 20, frames alone, rates claimed:", found, "; from 10 s, numbered by time:", numbered)
 pairs = [pair for pair, *_ in found.values()]
 sys.exit(
-    min(pairs[0], pairs[3], numbered[0]) < 15 or max(pairs[1], pairs[2]) > 2 or found[0][2] != [60.0, 45.0, 40.0, 37.5]
+    min(pairs[0], pairs[3], numbered[0]) < 15
+    or max(pairs[1], pairs[2]) > 2
+    or found[0][2] != [60.0, 45.0, 40.0, 37.5]
     or found[1_000][2][:3] != [1.0, 1.9, 2.8]
 )
 PY

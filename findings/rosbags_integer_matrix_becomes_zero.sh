@@ -1,8 +1,8 @@
 #!/bin/sh
 # Guess: rosbags either converts an array of another type than the message's, or refuses it.
-# Found: an array with items of the same size is taken as it lies in memory. A camera matrix of integers, as numpy makes of
-#        [600, 0, 320, ...], is stored as if its bits were float64: fx 600 becomes 2.96e-321, with no error or warning.
-#        The same matrix as float32 or as a list is refused. ROS 1 and ROS 2 alike.
+# Found: an array with items of the same size is taken as it lies in memory. A camera matrix of integers, as numpy makes
+#        of [600, 0, 320, ...], is stored as if its bits were float64: fx 600 becomes 2.96e-321, with no error or
+#        warning. The same matrix as float32 or as a list is refused. ROS 1 and ROS 2 alike.
 # Seen:  rosbags 0.11.9, Python 3.11, Linux x86-64.
 # Who:   users who write bags with camera matrices or rotations of whole numbers (np.eye(3, dtype=int)).
 # What to do: np.asarray(matrix, np.float64) on every array of a message.
@@ -38,8 +38,10 @@ for store in (Stores.ROS2_HUMBLE, Stores.ROS1_NOETIC):
         return float((read.K if first else read.k)[0])
 
     found = {
-        "float64": stored(np.array(K, np.float64)), "int64": stored(np.array(K)),
-        "float32": stored(np.array(K, np.float32)), "list": stored(K),
+        "float64": stored(np.array(K, np.float64)),
+        "int64": stored(np.array(K)),
+        "float32": stored(np.array(K, np.float32)),
+        "list": stored(K),
     }
     print(store.name, found)
     refused = isinstance(found["float32"], str) and isinstance(found["list"], str)

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Guess: trimesh scales colours of 16 bits, which LAS files hold, to its 8 bits, as it scales floats of 0 to 1; or refuses.
+# Guess: trimesh scales colours of 16 bits, which LAS files hold, to its 8 bits, as it scales floats of 0 to 1; or
+#        refuses.
 # Found: it keeps the lower byte. LAS's 16 bits are the 8 of a picture times 256, so that every colour is black: orange
 #        (65280, 32768, 16384) becomes (0, 0, 0); times 257, as other writers have it, 65535 happens to be right, and
 #        128 * 256 + 10 becomes 10. The same in a mesh's vertex colours and in what is exported; no warning.
