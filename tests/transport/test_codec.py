@@ -29,7 +29,13 @@ from semantic_mapper.transport.codec import (
     repack_rgb,
     unpack_parts,
 )
-from semantic_mapper.transport.images import CodecOptions, depth_from_uint16, depth_to_uint16, sniff_image
+from semantic_mapper.transport.images import (
+    CodecOptions,
+    depth_from_uint16,
+    depth_to_uint16,
+    encode_uint8,
+    sniff_image,
+)
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES, LabelledKeyframe, WeightsUpdate
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
@@ -250,3 +256,15 @@ def test_a_payload_that_is_no_framed_message_is_refused(payload: bytes) -> None:
     except CodecError:
         return
     assert len(parts) <= 8 and all(isinstance(part, bytes) for part in parts)
+
+
+def test_a_compressed_image_takes_no_more_memory_than_it_is_long():
+    image = np.zeros((480, 640), np.uint8)
+    encode_uint8(image)  # makes the compressor of this thread
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        _, packed = encode_uint8(image)
+        assert tracemalloc.get_traced_memory()[0] - before < len(packed) + 1000
+    finally:
+        tracemalloc.stop()
