@@ -13,6 +13,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +158,8 @@ def main() -> None:
                 tested[log] = range(1, count, max(2, count // options.frames // 2 * 2))
             example = tuple(torch.from_numpy(inputs[0][name]) for name in NAMES)
             torch.onnx.export(_Exported(model).eval(), example, exact, input_names=list(NAMES), dynamo=False)
-        quant_pre_process(exact, prepared, skip_symbolic_shape=True)
+        with chdir(folder):  # where it leaves files of its own
+            quant_pre_process(exact, prepared, skip_symbolic_shape=True)
         kinds = {"activation_type": QuantType.QUInt8, "weight_type": QuantType.QInt8, "per_channel": True}
         quantize_static(prepared, eight, _Frames(inputs), quant_format=QuantFormat.QDQ, **kinds)
         runs = {
