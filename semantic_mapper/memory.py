@@ -4,9 +4,10 @@ import ctypes
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)
 _SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate memory", "std::bad_alloc")
+_NO_THREAD = "Resource temporarily unavailable"
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
-# What mapping the demo takes, libraries included: it fails with 1.2 GB of address space, and holds 0.7 GB at most.
-NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 2.5, 1
+# What mapping the demo takes, libraries included: it fails with 1.2 GB of address space, and holds 0.4 GB at most.
+NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 2, 0.5
 _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 
 
@@ -63,6 +64,11 @@ def _with_causes(error: BaseException) -> list[BaseException]:
 
 def _says_shortage(error: BaseException) -> bool:
     text = str(error)
-    return isinstance(error, MemoryError) or (
-        any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault
+    no_thread = isinstance(error, RuntimeError) and _NO_THREAD in text  # of OpenVINO, whose stack finds no room
+    return (
+        isinstance(error, MemoryError)
+        or no_thread
+        or (
+            any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault
+        )
     )

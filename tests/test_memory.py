@@ -17,6 +17,8 @@ from tests.nodes.support import COMMAND, error_line
             True,
         ),
         (OSError(12, "Cannot allocate memory"), True),
+        (RuntimeError("Exception from plugin.cpp:54:\nResource temporarily unavailable"), True),
+        (BlockingIOError(11, "Resource temporarily unavailable"), False),
         (ImportError("libgomp.so.1: cannot allocate memory in static TLS block"), False),
         (ImportError("No module named 'torch'"), False),
     ],
