@@ -4,7 +4,7 @@ import ctypes
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)
 _SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate memory", "std::bad_alloc")
-_NO_THREAD = "Resource temporarily unavailable"
+_NO_THREAD = "Resource temporarily unavailable"  # what OpenVINO says where the system gives it no thread
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
 # What mapping the demo takes, libraries included: it fails with 1.2 GB of address space, and holds 0.4 GB at most.
 NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 2, 0.5
@@ -44,11 +44,11 @@ def memory_message(error: BaseException) -> str:
     """What to say where memory does not suffice: one line."""
     says = str(next((e for e in _with_causes(error) if _says_shortage(e)), error)).strip()
     lines = says.splitlines() or ["no memory left"]
-    reason = next((line for line in lines if any(words in line for words in _SHORTAGE)), lines[0])
+    reason = next((line for line in lines if any(words in line for words in (*_SHORTAGE, _NO_THREAD))), lines[0])
     return (
         f"not enough memory or address space ({reason[:_MAX_REASON]}); semantic-mapper needs about "
         f"{NEEDED_ADDRESS_SPACE_GB:g} GB of address space and {NEEDED_MEMORY_GB:g} GB of memory, and more for large "
-        "maps: free some, or raise the limit (ulimit -v)"
+        "maps: free some, or raise the limit (ulimit -v; ulimit -u where it is one of threads)"
     )
 
 
@@ -64,11 +64,6 @@ def _with_causes(error: BaseException) -> list[BaseException]:
 
 def _says_shortage(error: BaseException) -> bool:
     text = str(error)
-    no_thread = isinstance(error, RuntimeError) and _NO_THREAD in text  # of OpenVINO, whose stack finds no room
-    return (
-        isinstance(error, MemoryError)
-        or no_thread
-        or (
-            any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault
-        )
-    )
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_THREAD in text):
+        return True
+    return any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault

@@ -4,7 +4,7 @@ uv pip install onnx onnxruntime
 python -m research.bench.runtimes kitchen.mcap room.mcap
 
 All run one network, exported as ONNX. 8 bits are of static quantization (a scale a channel of weights), calibrated on
-frames of the logs that are not scored. Runtimes take turns at each frame; times are medians.
+even frames of the logs, of which odd ones are scored. Runtimes take turns at each frame; times are medians.
 """
 
 # Both packages are installed for this alone.
@@ -54,10 +54,10 @@ class _Exported(nn.Module):
 
 
 class _Network:
-    """In place of an ``ImageNetwork``; keeps what it was given."""
+    """In place of an ``ImageNetwork``; what it was given goes to ``seen``."""
 
-    def __init__(self, size: tuple[int, int], run: Run) -> None:
-        self.size, self._run, self.inputs = size, run, list[Inputs]()
+    def __init__(self, size: tuple[int, int], run: Run, seen: list[Inputs] | None = None) -> None:
+        self.size, self._run, self._seen = size, run, seen
 
     def encode(self, rgb: UInt8, maps: Float32, depth_m: Float32, spread: Float32, focal: float) -> EncodedImage:
         colours = rgb.transpose(2, 0, 1).astype(np.float32) / 255
@@ -66,7 +66,8 @@ class _Network:
         inputs = dict(
             zip(NAMES, (seen, depth_m[None, None], spread[None, None], np.array([focal], np.float32)), strict=True)
         )
-        self.inputs.append(inputs)
+        if self._seen is not None:
+            self._seen.append(inputs)
         feature, geometry = self._run(inputs)
         small = torch.nn.functional.adaptive_avg_pool2d(torch.from_numpy(colours), self.size)
         given = feature[0], geometry[0], small.permute(1, 2, 0).numpy(), np.empty(0, np.float32)
@@ -152,10 +153,9 @@ def main() -> None:
             for log in options.logs:
                 with open_log(log) as reader:
                     count = len(reader)
-                seen = _Network(size, own)
-                step_through(log, seen, range(0, count, max(1, count // options.calibration)))
-                inputs += seen.inputs
-                tested[log] = range(1, count, max(2, count // options.frames // 2 * 2))
+                apart = [max(1, count // frames // 2) * 2 for frames in (options.calibration, options.frames)]
+                step_through(log, _Network(size, own, inputs), range(0, count, apart[0]))
+                tested[log] = range(1, count, apart[1])
             example = tuple(torch.from_numpy(inputs[0][name]) for name in NAMES)
             torch.onnx.export(_Exported(model).eval(), example, exact, input_names=list(NAMES), dynamo=False)
         with chdir(folder):  # where it leaves files of its own

@@ -109,8 +109,7 @@ typedef struct {
     I64 cleared;             /* (B,) to fill: voxels of a surface that were cleared */
 } FuseArguments;
 
-/* Ask for what voxel k of `found` will need. Blocks lie in no order, and pixels are far apart: waiting for memory took
- * half of the time. */
+/* Ask for what voxel k of `found` will need: blocks lie in no order, and pixels are far apart. It saves a fifth. */
 INLINE void fetch_ahead(const FuseArguments *a, int64_t block, const VoxelsInView *found, int64_t k) {
     int64_t at = block * BLOCK_VOXELS + found->voxel[k], pixel = found->pixel[k];
     __builtin_prefetch(a->rgb.data + 3 * pixel);
@@ -124,10 +123,10 @@ INLINE void fetch_ahead(const FuseArguments *a, int64_t block, const VoxelsInVie
 
 /* The same of its evidence, once its row of the table is there. */
 INLINE void fetch_evidence(const FuseArguments *a, int64_t block, const VoxelsInView *found, int64_t k, float band) {
+    if (fabsf(found->distance[k]) > band) return;
     int64_t classes = a->votes.evidence.shape[1], row = a->votes.rows.data[found->pixel[k]];
     const char *own = (const char *)(a->buffers.evidence.data + (block * BLOCK_VOXELS + found->voxel[k]) * classes);
     const char *said = (const char *)(a->votes.evidence.data + max_i(row, 0) * classes);
-    if (fabsf(found->distance[k]) > band) return;
     for (int64_t at = 0; at < 2 * classes + CACHE_LINE - 1; at += CACHE_LINE) {
         __builtin_prefetch(own + at, 1);
         __builtin_prefetch(said + at);
