@@ -1,8 +1,10 @@
 """Places seen so far: which of them an image shows, and what a map keeps of its own. Matches are counted with each
 place in turn (1 ms each), which is exact and needs no vocabulary."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 DESCRIPTOR_BYTES = 128
 MAX_PLACES = 300  # that a map keeps
 MAX_FEATURES = 400  # of each: 140 bytes a feature
+
+_maker = ThreadPoolExecutor(1, "places")
 _SPACING_M, _SPACING_RAD = 0.2, np.deg2rad(12.0)  # a view this far from all places is a new one
 
 
@@ -51,11 +55,15 @@ def shared_places(ours: Iterable[Place], theirs: Iterable[Place]) -> int:
 
 
 class PlaceStore:
-    """The places of a map, oldest first; beyond ``capacity`` the younger of the two nearest to each other goes."""
+    """The places of a map, oldest first; beyond ``capacity`` the younger of the two nearest to each other goes.
+
+    Any thread may call it. What needs a place that is in the making waits for it: all is as if it had been added."""
 
     def __init__(self, places: Iterable[Place] = (), capacity: int = MAX_PLACES) -> None:
-        self._places = list(places)
+        self._places: list[Place | Future[Place]] = list(places)  # the last one may be in the making
+        self._poses = [place.T_world_camera for place in self._made()]
         self._capacity = capacity
+        self._lock = Lock()
 
     def __len__(self) -> int:
         return len(self._places)
@@ -63,26 +71,48 @@ class PlaceStore:
     @property
     def places(self) -> tuple[Place, ...]:
         """All, oldest first."""
-        return tuple(self._places)
+        with self._lock:
+            return self._made()
 
     def wants(self, T_world_camera: Float64) -> bool:
         """Whether a view from this pose is a new place."""
-        return bool((_apart(self._poses(), T_world_camera) > 1).all())
+        with self._lock:
+            return bool((_apart(np.reshape(self._poses, (-1, 4, 4)), T_world_camera) > 1).all())
 
     def add(self, place: Place) -> None:
         """Keep a place."""
-        self._places.append(place)
-        if len(self._places) > self._capacity:
-            poses = self._poses()[:-1]  # never the newest
-            del self._places[most_crowded(_apart(poses[:, None], poses[None]))[1]]
+        with self._lock:
+            self._keep(place, place.T_world_camera)
+
+    def add_soon(self, T_world_camera: Float64, make: Callable[[], Place]) -> None:
+        """Keep the place of a pose, which a thread makes while the caller goes on; its error comes at the next call."""
+        with self._lock:
+            self._keep(_maker.submit(make), T_world_camera)
 
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> None:
         """Give places other poses, by (camera_id, stamp_ns); those that are not named stay where they are."""
-        moved = [(p, poses.get((p.camera_id, p.stamp_ns))) for p in self._places]
-        self._places = [p if pose is None else replace(p, T_world_camera=pose.copy()) for p, pose in moved]
+        with self._lock:
+            moved = [(p, poses.get((p.camera_id, p.stamp_ns))) for p in self._made()]
+            self._places = [p if pose is None else replace(p, T_world_camera=pose.copy()) for p, pose in moved]
+            self._poses = [p.T_world_camera for p in self._made()]
 
-    def _poses(self) -> Float64:
-        return np.array([p.T_world_camera for p in self._places]).reshape(-1, 4, 4)
+    def _made(self) -> tuple[Place, ...]:
+        try:
+            made = tuple(p.result() if isinstance(p, Future) else p for p in self._places)
+        except BaseException:
+            del self._places[-1], self._poses[-1]
+            raise
+        self._places[:] = made
+        return made
+
+    def _keep(self, place: Place | Future[Place], T_world_camera: Float64) -> None:
+        self._made()
+        self._places.append(place)
+        self._poses.append(T_world_camera)
+        if len(self._places) > self._capacity:
+            poses = np.stack(self._poses[:-1])  # never the newest
+            one = most_crowded(_apart(poses[:, None], poses[None]))[1]
+            del self._places[one], self._poses[one]
 
 
 def view_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:

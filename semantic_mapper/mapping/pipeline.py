@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import cv2
@@ -31,7 +32,7 @@ from semantic_mapper.imaging import (
 )
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.localization.features import find_place_features
-from semantic_mapper.localization.places import MAX_FEATURES, make_place
+from semantic_mapper.localization.places import MAX_FEATURES, Place, make_place
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction import MapCorrector
 from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust, rendered_trust
@@ -345,9 +346,7 @@ class MappingPipeline:
             self.keyframes.add(keyframe)
         places, pose = self.voxel_map.places, frame.T_world_camera
         if self.config.keyframes.save_places and is_measured(frame) and places.wants(pose):
-            assert frame.depth_m is not None
-            found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
-            places.add(make_place(frame.camera_id, frame.stamp_ns, pose, found, frame.intrinsics))
+            places.add_soon(pose, partial(_place_of, frame))
         return is_keyframe
 
     def _make_keyframe(self, views: FrameViews, encoded: Encoded, *, labelled: bool = False) -> Keyframe:
@@ -406,7 +405,8 @@ class MappingPipeline:
         """Class ids and confidence (H, W) of what the pixels take from a view; row -1 is unknown."""
         channel, most = likeliest(view.probabilities)
         ids = np.append(self.label_set.to_ids(channel.ravel()), np.uint8(self.label_set.ignore_id))
-        return ids[rows], np.append(most, np.float32(0))[rows]
+        # Twice as fast as by index.
+        return ids.take(rows, mode="wrap"), np.append(most, np.float32(0)).take(rows, mode="wrap")
 
     # Besides the stages.
 
@@ -432,6 +432,12 @@ class MappingPipeline:
         full = self._upsample(views, rendered, self.voxel_map)
         table = rendered.probabilities.reshape(-1, len(self.label_set)), full.rows
         add_votes(self.voxel_map, view.T_world_camera, smaller, full.depth_m, table)
+
+
+def _place_of(frame: PosedFrame) -> Place:
+    assert frame.depth_m is not None
+    found = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
+    return make_place(frame.camera_id, frame.stamp_ns, frame.T_world_camera, found, frame.intrinsics)
 
 
 class FieldTrial:

@@ -1,5 +1,6 @@
 from functools import cache
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -86,6 +87,29 @@ def test_places_that_are_no_poses_are_refused(tmp_path: Path) -> None:
     voxel_map.save(tmp_path / "map.npz")
     with pytest.raises(MapError, match="its places"):
         VoxelMap.load(tmp_path / "map.npz")
+
+
+def test_a_place_in_the_making_counts_at_once_and_is_waited_for_where_it_is_read() -> None:
+    store, go_on = PlaceStore(), Event()
+    place = Place("c", 1, np.eye(4), np.zeros((1, 3), np.float32), np.zeros((1, 128), np.uint8))
+
+    def make() -> Place:
+        assert go_on.wait(60)
+        return place
+
+    store.add_soon(np.eye(4), make)
+    assert not store.wants(np.eye(4)) and len(store) == 1
+    go_on.set()
+    assert store.places == (place,)
+
+    def fail() -> Place:
+        raise MemoryError("no room")
+
+    elsewhere = np.diag([-1.0, -1, 1, 1])
+    store.add_soon(elsewhere, fail)
+    with pytest.raises(MemoryError):
+        _ = store.places
+    assert store.places == (place,) and store.wants(elsewhere)
 
 
 def test_a_full_store_lets_the_most_crowded_place_go() -> None:
