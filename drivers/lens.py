@@ -5,10 +5,12 @@ A lens is judged by its values: zeros at the end of the coefficients say nothing
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics
+from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float64
 
 # Coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty.
 _PINHOLE = (
@@ -20,6 +22,8 @@ _FISHEYE = ("equidistant", "equi", "fisheye", "opencv_fisheye", "fisheye_opencv"
 _ZERO_IS_PINHOLE = ("brown_conrady", "inverse_brown_conrady", "modified_brown_conrady", "division")
 
 MAX_HALF_VIEW = np.radians(65.0)  # to each side of what a fisheye's image is cut to: a pinhole stretches what is beyond
+MAX_INVERSE_PX = 1e-6  # by which the ray of a pixel may miss it
+_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-12)
 _THETAS = np.linspace(0.0, np.pi, 4096)
 
 
@@ -59,6 +63,31 @@ def lens_intrinsics(
 
 def _plain(model: str) -> str:
     return model.strip().lower().replace("-", "_")
+
+
+def undistort(pixels: Float64, lens: CameraIntrinsics) -> Float64:
+    """(N, 2) pixels of an image with distortion -> slopes (N, 2) of their rays, x / z and y / z in the camera's axes.
+
+    Raises FrameError: a pixel that the lens model gives to no ray (to within ``MAX_INVERSE_PX``).
+    """
+    if not len(pixels):
+        return np.zeros((0, 2))
+    K, coefficients, still = camera_matrix(lens), np.array(lens.distortion or (0.0,) * 4), np.zeros(3)
+    # By default OpenCV ends after five rounds: pixels off at the corner of a usual lens.
+    invert, project = cv2.undistortPoints, cv2.projectPoints
+    if isinstance(lens, FisheyeIntrinsics):
+        invert, project = cv2.fisheye.undistortPoints, cv2.fisheye.projectPoints
+    slopes = np.asarray(invert(pixels[:, None], K, coefficients, criteria=_UNTIL), np.float64)
+    rays = np.concatenate((slopes, np.ones((len(slopes), 1, 1))), axis=2)
+    back, _ = project(rays, still, still, K, coefficients)
+    off = np.linalg.norm(np.asarray(back).reshape(-1, 2) - pixels, axis=1)
+    if not off.max() <= MAX_INVERSE_PX:  # NaN, too
+        u, v = pixels[int(np.argmax(off))]
+        raise FrameError(
+            f"the lens distortion {list(lens.distortion)} gives pixel {u:.0f}, {v:.0f} of {lens.width}x{lens.height} "
+            "to no ray; calibrate again, with a board in all corners of the image"
+        )
+    return slopes.reshape(-1, 2)
 
 
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:

@@ -13,6 +13,7 @@ from semantic_mapper.drivers.calibrating.views import (
     shortfalls,
     tilt_radians,
 )
+from semantic_mapper.drivers.lens import undistort
 from semantic_mapper.drivers.poses.board import board_poses
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.geometry import camera_matrix, make_pose, rotation_vector
@@ -82,12 +83,8 @@ def compare_camera(
 
 def ideal_pixels(pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
     """(N, 2) -> where a camera without distortion, otherwise the same, would see them."""
-    if not any(intrinsics.distortion):
-        return pixels
     K = camera_matrix(intrinsics)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-    ideal = cv2.undistortImagePoints(pixels[:, None], K, np.array(intrinsics.distortion), None, criteria)
-    return np.asarray(ideal, np.float64).reshape(-1, 2)
+    return undistort(pixels, intrinsics) * K.diagonal()[:2] + K[:2, 2]
 
 
 def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: CalibrationConfig) -> CameraCalibration:

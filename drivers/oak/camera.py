@@ -143,8 +143,12 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
 
     Raises RuntimeError, FrameError: the calibration knows no such camera, or does not fit the image.
     """
-    board_socket = getattr(load_depthai().CameraBoardSocket, socket)
-    return _pinhole(calibration.getCameraIntrinsics(board_socket, width, height), width, height)
+    # `getCameraIntrinsics` of another ratio is for an image with bars; `requestOutput` fills the image and crops.
+    K, *size = calibration.getDefaultIntrinsics(getattr(load_depthai().CameraBoardSocket, socket))
+    scale = max(width / size[0], height / size[1])
+    K = scale * np.array(K)
+    K[:2, 2] -= (scale * np.array(size) - (width, height)) / 2
+    return _pinhole(K, width, height)
 
 
 def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:

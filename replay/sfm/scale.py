@@ -11,9 +11,9 @@ from scipy.spatial.distance import cdist
 
 from semantic_mapper.bundle.scale import Floor, cone
 from semantic_mapper.config import MapperConfig
+from semantic_mapper.drivers.lens import undistort
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.sfm.between import RegisteredFrame
 from semantic_mapper.transport.messages import SCENE_DEPTH_KEY, StreamInfo
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, UInt8
@@ -136,9 +136,7 @@ def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
 
 def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
     """Origin and unit direction in the world of a pixel (2,) of an image with distortion."""
-    lens = np.array(intrinsics.distortion or (0.0,) * 4)
-    flat = cv2.undistortPoints(np.asarray(xy, np.float64).reshape(1, 1, 2), camera_matrix(intrinsics), lens)
-    direction = T_world_camera[:3, :3] @ np.array((*np.ravel(flat), 1.0))
+    direction = T_world_camera[:3, :3] @ np.array((*undistort(xy[None], intrinsics)[0], 1.0))
     return T_world_camera[:3, 3], direction / np.linalg.norm(direction)
 
 
@@ -191,11 +189,10 @@ def vertical(
     An edge and its camera span a plane, in which the edge's direction lies. The direction is sought that lies in the
     planes of most edges, by their length.
     """
-    K, lens = camera_matrix(intrinsics), np.array(intrinsics.distortion or (0.0,) * 4)
     normals: list[Float64] = []
     for index, rows in edges.items():
         if index in poses and len(rows):
-            flat = cv2.undistortPoints(rows.reshape(-1, 1, 2), K, lens).reshape(-1, 2, 2)
+            flat = undistort(rows.reshape(-1, 2), intrinsics).reshape(-1, 2, 2)
             rays = np.concatenate((flat, np.ones((*flat.shape[:2], 1))), axis=2)
             normals.append(np.cross(rays[:, 0], rays[:, 1]) @ poses[index][:3, :3].T)
     planes = np.concatenate([np.zeros((0, 3)), *normals])

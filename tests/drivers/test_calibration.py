@@ -14,7 +14,7 @@ from semantic_mapper.drivers.calibration import (
     load_mount,
     save_calibration,
 )
-from semantic_mapper.drivers.lens import lens_intrinsics
+from semantic_mapper.drivers.lens import lens_intrinsics, undistort
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.geometry import camera_matrix, project, scale_intrinsics
 from semantic_mapper.types import CameraIntrinsics, FisheyeIntrinsics
@@ -113,6 +113,36 @@ def test_other_lenses_are_refused_and_a_fisheye_without_coefficients_is_one_all_
     k = frame.intrinsics
     with pytest.raises(FrameError, match="fisheye lens has to be rectified"):
         replace(frame, intrinsics=FisheyeIntrinsics(k.fx, k.fy, k.cx, k.cy, k.width, k.height, (0.0,) * 4))
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        CameraIntrinsics(800.0, 800.0, 639.5, 479.5, 1280, 960),
+        CameraIntrinsics(800.0, 800.0, 639.5, 479.5, 1280, 960, (-0.3, 0.1, 0.0, 0.0, -0.015)),
+        FisheyeIntrinsics(700.0, 700.0, 639.5, 479.5, 1280, 960, (0.02, 0.01, -0.002, 0.0003)),
+    ],
+)
+def test_a_lens_is_inverted_to_its_corners(lens: CameraIntrinsics) -> None:
+    u, v = np.meshgrid(np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 7))
+    slopes = undistort(np.stack((u.ravel(), v.ravel()), axis=1), lens)
+    # Written out: OpenCV's documentation of both models.
+    r = np.linalg.norm(slopes, axis=1)
+    if isinstance(lens, FisheyeIntrinsics):
+        theta = np.arctan(r)
+        bent = theta * (1 + sum(k * theta ** (2 * n) for n, k in enumerate(lens.distortion, 1))) / np.maximum(r, 1e-9)
+    else:
+        k1, k2, _, _, k3 = lens.distortion or (0.0,) * 5
+        bent = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+    seen = slopes * bent[:, None] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    np.testing.assert_allclose(seen, np.stack((u.ravel(), v.ravel()), axis=1), atol=1e-6)
+    assert undistort(np.zeros((0, 2)), lens).shape == (0, 2)
+
+
+def test_a_pixel_that_a_lens_gives_to_no_ray_is_an_error() -> None:
+    folded = CameraIntrinsics(800.0, 800.0, 639.5, 479.5, 1280, 960, (-0.6, 0.0, 0.0, 0.0))
+    with pytest.raises(FrameError, match="to no ray; calibrate again"):
+        undistort(np.zeros((1, 2)), folded)
 
 
 def test_points_lie_where_the_rectified_camera_projects_them() -> None:

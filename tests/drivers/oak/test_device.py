@@ -24,9 +24,14 @@ def test_every_setting_has_its_name_in_depthai() -> None:
 
 def test_intrinsics_follow_the_size_and_extrinsics_are_metres(calibration: Path) -> None:
     handler = load_calibration(None, str(calibration))
-    for height, cy in ((480, 235), (400, 195)):  # cropped
-        k = read_intrinsics(handler, "CAM_A", 640, height)
-        assert (k.fx, k.fy, k.cx, k.cy) == pytest.approx((500, 510, 325, cy))
+    # Of 1280x960: as it is, cut above and below, and cut at the sides.
+    for size, expected in (
+        ((640, 480), (500, 510, 325, 235)),
+        ((640, 400), (500, 510, 325, 195)),
+        ((600, 600), (625, 637.5, 306.25, 293.75)),
+    ):
+        k = read_intrinsics(handler, "CAM_A", *size)
+        assert (k.fx, k.fy, k.cx, k.cy) == pytest.approx(expected)
     np.testing.assert_allclose(rgb_to_left(handler, Config())[:3, 3], np.array(RGB_IN_LEFT_CM) / 100, atol=1e-6)
     np.testing.assert_allclose(rgb_to_left(handler, Config(rgb="CAM_B")), np.eye(4))
     with pytest.raises((RuntimeError, IndexError)):
