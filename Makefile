@@ -5,6 +5,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
+PYTHONS ?= 3.11 3.12 3.13
 READY := .venv/.ready
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
@@ -15,7 +16,7 @@ PYTEST := OMP_NUM_THREADS=1 $(TESTS)
 # Without bytecode, each process that a test starts would compile its packages again: seconds of CPU.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup slim demo test test-loaded test-gate test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
+.PHONY: help setup slim demo test test-loaded test-gate test-matrix test-slow test-research nightly test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -53,6 +54,9 @@ nightly: $(READY)  ## run all tests, those of research, and everything on a bare
 	$(MAKE) test-research
 	tools/bare_machine.sh "make demo && make test"
 	tools/bare_machine.sh "make slim && du -sm .venv && make demo && .venv/bin/semantic-mapper doctor"
+
+test-matrix: $(READY)  ## run the quick tests with each of PYTHONS, with the oldest packages and the newest
+	tools/test_matrix.sh $(PYTHONS)
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m research.experiments.v4l2_machine
