@@ -114,6 +114,8 @@ def small_gicp(setup: Setup) -> Peer:
         if len(poses) > 1:
             guess = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
             result = gicp.align(model, scan, guess, max_correspondence_distance=0.3, num_threads=1)
+            if not result.num_inliers:  # `converged` says yes all the same
+                return None
             poses.append(result.T_target_source)
         else:
             poses.append(np.eye(4))

@@ -20,6 +20,7 @@ from semantic_mapper.fields.base import CHUNK, Rays, Rendered, WorkingView
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.views import EncodedViews, stack_views
 from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.kernels import processor_flags
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, RayBatch, SourceViews
 
@@ -56,7 +57,7 @@ def to_device(batch: BatchT, device: torch.device) -> BatchT:
 
 def bfloat16_is_fast(device: torch.device) -> bool:
     """GPUs, and CPUs with matrix units (AMX); elsewhere float32 is faster."""
-    return device.type != "cpu" or bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+    return device.type != "cpu" or "amx_bf16" in processor_flags()  # older PyTorch does not tell
 
 
 def compute_in_bfloat16(model: nn.Module, names: Sequence[str], device_type: str) -> None:

@@ -237,8 +237,11 @@ class VoxelMap:
         return parts[0] if len(parts) == 1 else join_meshes(parts)
 
     def to_open3d(self) -> Any:
-        """A copy of the whole map, which is not empty, as an ``open3d.t.geometry.VoxelBlockGrid`` with tsdf, weight and
-        color (float32), label (uint8 id, the ignore id where unknown), and evidence and votes as they are stored."""
+        """A copy of the whole map as an ``open3d.t.geometry.VoxelBlockGrid`` with tsdf, weight and
+        color (float32), label (uint8 id, the ignore id where unknown), and evidence and votes as they are stored.
+
+        Open3D shows voxels of a weight above 3, unless its ``weight_threshold`` says otherwise, and averages labels
+        where it resamples points. ``MapError``: the map is empty."""
         state = self.block_state()
         keys = np.asarray(state.pop("keys"), np.int32)
         if not len(keys):

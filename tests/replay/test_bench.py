@@ -9,7 +9,7 @@ from semantic_mapper.config import MapperConfig, VoxelMapConfig, with_quality
 from semantic_mapper.replay.bench import bench_fusion, bench_pipeline
 from semantic_mapper.replay.log import demo_log
 from semantic_mapper.replay.peers.comparison import compare_peers, drift, write_peers
-from semantic_mapper.replay.peers.worker import Frame, Setup, octomap
+from semantic_mapper.replay.peers.worker import Frame, Setup, octomap, small_gicp
 from semantic_mapper.types import CameraIntrinsics
 from tests.contract.golden import form, undocumented
 from tests.drawn_room import truth_of, walk_frames
@@ -59,6 +59,18 @@ def test_points_of_octomap_lie_at_the_centres_of_its_voxels() -> None:
     assert len(points) > 50 and points[:, 2] == pytest.approx(1.025, abs=1e-6)
     assert points / 0.05 - 0.5 == pytest.approx(np.round(points / 0.05 - 0.5), abs=1e-4)
     assert np.abs(points[:, :2].mean(0)).max() < 0.005  # as the wall does, they lie round the axis
+
+
+def test_small_gicp_is_lost_where_no_point_has_a_match_although_it_says_converged() -> None:
+    pytest.importorskip("small_gicp", reason="the extra `peers`")
+    peer = small_gicp(Setup(30.0, 30.0, 15.5, 11.5, 32, 24, voxel_size_m=0.05, truncation_m=0.2, depth_max_m=5.0))
+    found = []
+    for depth_m in (1.0, 4.0, 1.0):
+        depth = np.full((24, 32), depth_m, np.float32)
+        found.append(peer.add(peer.prepare(Frame(0, np.zeros((24, 32, 3), np.uint8), depth, np.eye(4)))))
+    assert found[1] is None
+    for pose in (found[0], found[2]):
+        np.testing.assert_allclose(pose, np.eye(4), atol=1e-3)
 
 
 def test_drift_is_the_error_of_motions_and_of_aligned_positions() -> None:

@@ -60,10 +60,11 @@ def gather(client: FoxgloveClient, robot: Robot | None, wanted: set[str]) -> dic
     return found
 
 
-def read_picture(received: Received, flags: int = cv2.IMREAD_COLOR_RGB) -> np.ndarray:
+def read_picture(received: Received, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     picture = CompressedImage.FromString(received.data)
     assert picture.timestamp.ToNanoseconds() == received.log_time_ns
-    return cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
+    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), flags)
+    return image[..., ::-1] if flags == cv2.IMREAD_COLOR else image
 
 
 def read_cloud(received: Received) -> np.ndarray:

@@ -123,7 +123,7 @@ def test_the_session_says_what_to_paint_on_the_images_of_the_log(page: Page, log
     assert session["classes"][0] == {"id": WALL, "name": "wall", "color": list(ROOMS.colors[0])}
     answer = page.ask("frames/4/image")
     assert answer.headers["Content-Type"] == "image/jpeg"
-    seen = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR_RGB)
+    seen = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     with open_log(log) as opened:
         assert np.abs(seen.astype(int) - opened.frame(4).rgb).mean() < 4
 
