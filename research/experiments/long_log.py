@@ -1,7 +1,12 @@
-"""A long recording at the price of a short one: the frames of a room seen on a walk to and fro, with new stamps."""
+"""A long recording at the price of a short one: the frames of a room seen on a walk to and fro, with new stamps.
+
+As a program, one of many gigabytes in few frames, for what opens, cuts and recovers logs:
+python -m research.experiments.long_log big.mcap --gb 50
+"""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from pathlib import Path
 
@@ -45,3 +50,29 @@ def write_long_log(path: Path, seconds: float, hz: float) -> Path:
             frame = dataclasses.replace(walk[seq % len(walk)], seq=seq, stamp_ns=stamp_ns)
             log.write_frame(frame, encoded_rgb=images[seq % len(walk)])
     return path
+
+
+def write_big_log(path: Path, size_gb: float) -> Path:
+    """Frames of noise in colour, which no format packs: 6 MB each at 1920 x 1080, with a wall 2 m off as depth."""
+    rng = np.random.default_rng(0)
+    k = CameraIntrinsics(1400.0, 1400.0, 959.5, 539.5, 1920, 1080)
+    wall, pose = np.full((k.height, k.width), 2.0, np.float32), np.eye(4)
+    frames = [
+        PosedFrame(0, 0, "noise", rng.integers(0, 256, (k.height, k.width, 3), np.uint8), wall, None, k, pose)
+        for _ in range(4)
+    ]
+    images = [EncodedImage("png", encode_rgb(frame.rgb, "png", 0)) for frame in frames]
+    count = round(size_gb * 1e9 / len(images[0].data))
+    with LogWriter(path, StreamInfo("noise", {"noise": k}, ROOMS, count, 10.0)) as log:
+        for seq in range(count):
+            frame = dataclasses.replace(frames[seq % len(frames)], seq=seq, stamp_ns=(seq + 1) * 100_000_000)
+            log.write_frame(frame, encoded_rgb=images[seq % len(images)])
+    return path
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("log", type=Path)
+    parser.add_argument("--gb", type=float, default=50.0)
+    options = parser.parse_args()
+    write_big_log(options.log, options.gb)
