@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -346,7 +347,11 @@ class MappingPipeline:
             self.keyframes.add(keyframe)
         places, pose = self.voxel_map.places, frame.T_world_camera
         if self.config.keyframes.save_places and is_measured(frame) and places.wants(pose):
-            places.add_soon(pose, partial(_place_of, frame))
+            assert frame.depth_m is not None
+            kept = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy(), T_world_camera=pose.copy())
+            places.add_soon(
+                kept.T_world_camera, partial(_place_of, kept)
+            )  # a copy: the caller may use its arrays again
         return is_keyframe
 
     def _make_keyframe(self, views: FrameViews, encoded: Encoded, *, labelled: bool = False) -> Keyframe:

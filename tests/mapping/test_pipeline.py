@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import replace
+from threading import Event
 
 import numpy as np
 import pytest
@@ -15,9 +16,11 @@ from semantic_mapper.fields.scene.grid import GridField
 from semantic_mapper.fields.streaming import StreamingSRay
 from semantic_mapper.fields.weights import default_checkpoint_path, load_weights
 from semantic_mapper.labels import NYU40, ROOMS
+from semantic_mapper.localization.places import Place, PlaceStore
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.drawn_room import walk_frames
 from tests.mapping.test_voxel_map import same
 from tests.small import tiny_config, tiny_field, tiny_frames, tiny_pipeline
 
@@ -51,6 +54,29 @@ def test_bad_frames_are_refused_and_leave_the_map_as_it_was():
         a.step(frame)
         b.step(frame)
     assert same(a.voxel_map.block_state(), b.voxel_map.block_state())
+
+
+def test_arrays_of_a_frame_may_be_used_again_after_its_step():
+    """Its place is made by a thread, which is held up here until they have been."""
+    usual, reused, go_on = tiny_pipeline(), tiny_pipeline(), Event()
+    frame = walk_frames(7, 1, CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120))[0]
+    usual.step(frame)
+    [place] = usual.voxel_map.places.places
+    assert len(place.points) > 10
+
+    def wait() -> Place:
+        assert go_on.wait(60)
+        return place
+
+    PlaceStore().add_soon(np.eye(4), wait)
+    assert frame.depth_m is not None
+    rgb, depth, pose = frame.rgb.copy(), frame.depth_m.copy(), frame.T_world_camera.copy()
+    reused.step(replace(frame, rgb=rgb, depth_m=depth, T_world_camera=pose))
+    rgb[:], depth[:], pose[:] = 0, 0, 0
+    go_on.set()
+    [found] = reused.voxel_map.places.places
+    np.testing.assert_array_equal(found.points, place.points)
+    np.testing.assert_array_equal(found.T_world_camera, place.T_world_camera)
 
 
 def test_cameras_of_two_sizes_have_each_their_own_keyframes():
