@@ -1,4 +1,4 @@
-"""``semantic-mapper eval``: figures of replays side by side, or of a log by several methods."""
+"""``semantic-mapper eval``: figures of replays side by side, of a log by several methods, or of two runs of one log."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,9 +6,10 @@ from typing import Annotated, Any
 import typer
 
 from semantic_mapper.config import AtLeastZero
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.files import write_json
 from semantic_mapper.nodes.cli.verb import (
+    EXIT_FAILED,
     JsonOutput,
     MapperSettings,
     MaxFramesOption,
@@ -16,53 +17,73 @@ from semantic_mapper.nodes.cli.verb import (
     must_be_there,
     refuse_options,
     verb,
+    wrong_usage,
 )
 from semantic_mapper.nodes.console import frame_progress
+from semantic_mapper.replay.compare import Tolerances, compare_runs, read_run
 from semantic_mapper.replay.evaluate.mesh_surface import compare_with_mesh
 from semantic_mapper.replay.evaluate.report import score_table, write_eval_report
 from semantic_mapper.replay.run_folder import MAP_SUFFIX, is_log, prepare_file
 from semantic_mapper.replay.summary import notes, percent, read_summary, summary_table
+
+_SAME = Tolerances()
 
 
 @verb
 def evaluate(
     output: JsonOutput,
     mapper: MapperSettings,
-    # folders of `map`; logs, or folders with their parts
+    # folders of `map`; logs, or their folders
     targets: Annotated[list[Path], typer.Argument(metavar="DIR|LOG")],
     *,
     weights: WeightsOption = None,
-    baselines: bool = False,  # LOG: also fit baselines to the keyframes
-    seconds: AtLeastZero = 300.0,  # --baselines: to train the U-Net
+    baselines: AtLeastZero = 0.0,  # LOG: seconds to fit baselines in; 0 = none
     mesh: Path | None = None,  # DIR: a reference mesh (.npz) to compare with
-    # LOG: true objects, [CAMERA/]NNNNNN.png, for panoptic quality
+    # LOG: true objects, [CAMERA/]NNNNNN.png
     instances: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
     max_frames: MaxFramesOption = 0,
     out: Path | None = None,  # JSON [DIR/eval.json or LOG.eval.json]
-) -> None:
-    """Score logs, and results of `map`: figures, and a page.
+    # DIR: another result, to come to the same
+    against: Annotated[Path | None, typer.Option(metavar="DIR|map.npz")] = None,
+    score: AtLeastZero = _SAME.score,  # --against: allowed of scores
+    surface_m: AtLeastZero = _SAME.surface_m,  # --against: allowed, metres
+    labels: AtLeastZero = _SAME.labels,  # --against: allowed of classes
+) -> int:
+    """Score logs and results of `map`, or compare two results.
 
     A DIR gives the figures of its `map`. A LOG is mapped and scored; keyframes of its weights never count. --baselines
-    adds a per-image U-Net and labels carried over by depth, made from those keyframes. Writes JSON, and HTML next to
-    it.
+    adds a per-image U-Net and labels carried over by depth, made from those. Writes JSON and HTML. --against
+    writes nothing; exit code 1 where scores or surfaces differ.
 
     Example: semantic-mapper eval runs/a runs/b
-    Example: semantic-mapper eval a.mcap --weights a.safetensors --baselines
-    Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
+    Example: semantic-mapper eval a.mcap --weights a.safetensors --baselines 300
+    Example: semantic-mapper eval runs/after --against runs/before --labels 0.05
     """
+    tolerances = Tolerances(score=score, surface_m=surface_m, labels=labels)
+    logs = [] if against else [t for t in targets if is_log(t) or not t.is_dir()]
+    of_logs = {
+        "--weights": weights,
+        "--baselines": baselines,
+        "--instances": instances,
+        "--max-frames": max_frames,
+        "settings of the mapper": mapper.path or mapper.given,
+    }
+    refuse_options(
+        *((value and not logs, name, "goes with a LOG") for name, value in of_logs.items()),
+        (against and (mesh or out), "--mesh, --out", "do not go with --against"),
+        (tolerances != _SAME and not against, "--score, --surface-m, --labels", "go with --against"),
+        (against and len(targets) > 1, "--against", "compares one result with another"),
+    )
+    if against:
+        return _compare(output, targets[0], against, tolerances)
     if out is not None and out.is_file() and out.suffix != ".json":  # weights, say, that were named by mistake
         raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
     must_be_there(*targets)
     for target in targets:
         if target.suffix == MAP_SUFFIX:
             raise ConfigError(f"{target}: is a map alone; give the folder with its summary.json, or a log")
-    logs = [t for t in targets if is_log(t) or not t.is_dir()]
     folders = [t for t in targets if t not in logs]
-    refuse_options(
-        (baselines and seconds == 0, "--seconds", "the U-Net needs time to learn"),
-        (mesh is not None and not folders, "--mesh", "goes with a DIR that `map` has written"),
-        (instances is not None and not logs, "--instances", "goes with a LOG"),
-    )
+    refuse_options((mesh is not None and not folders, "--mesh", "goes with a DIR that `map` has written"))
     path = out or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     prepare_file(path)
     summaries = {str(folder): read_summary(folder) for folder in folders}
@@ -80,9 +101,8 @@ def evaluate(
     settings = mapper.load()
     for log in logs:
         with frame_progress("score", None) as bar:
-            baseline_s = seconds if baselines else 0.0
             scores = evaluate_log(
-                log, weights, settings, max_frames, baseline_s=baseline_s, instances=instances, monitor=bar
+                log, weights, settings, max_frames, baseline_s=baselines, instances=instances, monitor=bar
             ).plain()
         found["logs"][str(log)] = scores
         output.print(score_table(log.name, scores))
@@ -90,6 +110,19 @@ def evaluate(
     write_eval_report(page := path.with_suffix(".html"), found, folders)
     output.print(f"written to {path} and, for a browser, {page}")
     output.json(found)
+    return 0
+
+
+def _compare(output: JsonOutput, a: Path, b: Path, tolerances: Tolerances) -> int:
+    """Print what differs between two results of one log; the exit code."""
+    with wrong_usage(SemanticMapperError):
+        comparison = compare_runs(read_run(a), read_run(b), tolerances)
+    for line in (*comparison.figures, *comparison.notes):
+        output.print(str(line))
+    different = ", ".join(figure.name for figure in comparison.differences)
+    output.print(f"different: {different}" if different else "equal")
+    output.json({"a": str(a), "b": str(b), **comparison.to_plain()})
+    return 0 if comparison.equal else EXIT_FAILED
 
 
 def _surface_line(figures: dict[str, Any]) -> str:

@@ -25,8 +25,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "demo": ("demo:demo", "Map a recorded log that comes with the package."),
         "map": ("mapping:map_", "Map a recording: a log, a film, or what `import` takes."),
         "import": ("importing:import_", "Make a log of a film or of a recording of another program."),
-        "eval": ("eval:evaluate", "Score logs, and results of `map`: figures, and a page."),
-        "compare": ("compare:compare", "Compare two results of one log: scores and surfaces."),
+        "eval": ("eval:evaluate", "Score logs and results of `map`, or compare two results."),
         "fleet": ("fleet:app", "Map, score, label and finetune many logs."),
     },
     "Live": {

@@ -159,7 +159,7 @@ def test_what_a_killed_mapper_leaves_can_be_asked(tmp_path: Path) -> None:
     for arguments in (("info", tmp_path), ("query", tmp_path, "nearest", "wall", "0", "0", "1")):
         ran = api.run_here(*arguments)
         assert ran.code == 0, ran.stderr
-    ran = api.run_here("compare", tmp_path, STORED)
+    ran = api.run_here("eval", tmp_path, "--against", STORED)
     assert ran.code == 0, ran.stdout
 
 

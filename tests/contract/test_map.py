@@ -110,7 +110,7 @@ def test_two_replays_are_equal_bit_for_bit(room_run: Path, tmp_path: Path) -> No
     again = replay_room(tmp_path)
     for name in ("map.ply", "map.npz"):
         assert digest((again / name).read_bytes()) == digest((room_run / name).read_bytes())
-    compared = api.run_here("compare", room_run, again, "--json")
+    compared = api.run_here("eval", room_run, "--against", again, "--json")
     assert compared.code == 0, compared.stdout
     one, other = (summary_of(run) for run in (room_run, again))
     for part in ("frames", "map", "metrics", "metrics_per_image", "config", "labels", "refusals"):
@@ -126,7 +126,7 @@ def test_lockstep_processes_make_the_map_of_one_process_bit_for_bit(room_run: Pa
     assert ran.code == 0, ran.stderr
     for name in ("map.ply", "map.npz"):
         assert digest((tmp_path / "up" / name).read_bytes()) == digest((room_run / name).read_bytes())
-    compared = api.run_here("compare", room_run, tmp_path / "up")
+    compared = api.run_here("eval", room_run, "--against", tmp_path / "up")
     assert compared.code == 0, compared.stdout
     assert lacking(read("map")["summary"], form(summary_of(tmp_path / "up"))) == []
 

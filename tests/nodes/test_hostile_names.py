@@ -82,7 +82,7 @@ def test_names_in_results_maps_and_scores_are_text(hostile: Path, results: Path,
         ("info", results / "map.npz"),
         ("eval", results),
         ("eval", log, "--weights", weights, "--config", config, "--out", tmp_path / "eval.json"),
-        ("compare", results, results),
+        ("eval", results, "--against", results),
         ("query", results, "instances"),
         ("query", results, "class", "[/b]"),
         ("export", results, "--out", tmp_path / "map.ply"),
@@ -156,7 +156,7 @@ def test_no_result_goes_through_a_link(tmp_path: Path, log: Path, weights: Path,
     (out / ".writable").symlink_to(tmp_path / "made")
     run_ok("map", log, "--out", out, "--weights", weights, "--config", config)
     run_ok("eval", out)
-    run("compare", replayed, out)
+    run("eval", replayed, "--against", out)
     assert target.read_bytes() == b"precious" and not (tmp_path / "made").exists()
     assert all((out / name).is_file() and not (out / name).is_symlink() for name in RESULTS)
 

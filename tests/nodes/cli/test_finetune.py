@@ -75,7 +75,7 @@ def test_eval_compares_on_frames_that_nobody_was_fitted_to(
     log: Path, tuned: Path, config: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "eval.json"
-    options = ("--weights", tuned, "--baselines", "--seconds", "1", "--config", config, "--out", file)
+    options = ("--weights", tuned, "--baselines", "1", "--config", config, "--out", file)
     assert "per-image U-Net" in run_ok("eval", log, *options).stdout
     scores = json.loads(file.read_text())["logs"][str(log)]
     assert scores["scored"] == 3 and scores["excluded"] == 3
