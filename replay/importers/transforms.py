@@ -28,7 +28,7 @@ from semantic_mapper.replay.importers import tables
 from semantic_mapper.replay.importers.base import BadFrameError, DepthScale, ImportOptions, camera_of, first_size
 from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
-from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics
+from semantic_mapper.types import CameraIntrinsics
 
 FILE = "transforms.json"
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # Blender's data sets leave them out
@@ -41,7 +41,6 @@ _REFUSED = re.compile(
     r"|(camera_|world_)?(coordinate_system|coordinate_convention|convention|axes)"
 )
 _OUR_AXES = ("opengl", "blender", "nerf", "nerfstudio", "arkit")
-_BELIEVABLE_S = (1e-3, 10.0)  # between two frames
 # A frame's own stand for all of the file's.
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _Row = tuple[float, float, float, float]
@@ -78,7 +77,6 @@ class _Frame(_Lens, kw_only=True):
     transform_matrix: _Matrix
     depth_file_path: str | None = None
     depth_path: str | None = None
-    timestamp: float | str | None = None  # in a unit that nothing tells
 
 
 class _Transforms(_Lens, kw_only=True):
@@ -113,19 +111,18 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     read = tables.keep_good(read_frame, enumerate(found.frames), "frame", notices)
     frames = [frame for frame, _ in read]
     size = (0.0, 0.0) if (found.w and found.h) or not read else first_size((image for _, image in read), folder)
-    stamps_ns = _stamps([_time(frame) for frame in frames], file, notices)
     factor = _metres_per_unit(found, file, notices) if options.scale is None else 1.0
 
-    def picture_of(stamped: tuple[tuple[_Frame, Path], int | None]) -> PosedPicture:
-        (frame, image), stamp_ns = stamped
+    def picture_of(read: tuple[_Frame, Path]) -> PosedPicture:
+        frame, image = read
         T = np.eye(4)
         T[: len(frame.transform_matrix)] = frame.transform_matrix
         T[:3, 3] *= factor
         lens = _intrinsics(frame, (frame.w or size[0], frame.h or size[1]), image)
         depth = frame.depth_file_path or frame.depth_path
-        return PosedPicture(image, lens, T @ GL_AXES, stamp_ns, tables.inside(folder, depth) if depth else None)
+        return PosedPicture(image, lens, T @ GL_AXES, depth_file=tables.inside(folder, depth) if depth else None)
 
-    pictures = tables.keep_good(picture_of, zip(read, stamps_ns, strict=True), "frame", notices)
+    pictures = tables.keep_good(picture_of, read, "frame", notices)
     pictures.sort(key=lambda picture: numeric_order(picture.file.name))
     scale = _depth_scale(file, found, frames, options, factor)
     has_sensor = any(frame.depth_file_path for frame in frames) and not options.without_depth
@@ -174,31 +171,6 @@ def _metres_per_unit(found: _Transforms, file: Path, notices: list[str]) -> floa
         return 1.0
     notices.append(f"{file}: positions are multiplied by {1 / scale:g}, as applied_scale and applied_transform say")
     return 1 / scale
-
-
-def _time(frame: _Frame) -> float | None:
-    """A frame's time in the file's unit; None if it is missing or impossible."""
-    try:
-        time = float(frame.timestamp) if frame.timestamp is not None else math.nan
-    except ValueError:
-        return None
-    return time if 0 <= time < math.inf else None
-
-
-def _stamps(times: Sequence[float | None], file: Path, notices: list[str]) -> list[int | None]:
-    """Nanoseconds. The unit is that of Unix times where they are as large as these, else it follows from the gap."""
-    known = np.sort([time for time in times if time is not None])
-    if not len(known):
-        return [None] * len(times)
-    gap = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
-    unix = [n for n in range(4) if 1e9 <= known[-1] / 1000**n <= 4e9 and gap / 1000**n <= 1000]
-    usual = [n for n in range(4) if _BELIEVABLE_S[0] <= gap / 1000**n <= _BELIEVABLE_S[1]]
-    steps = next(iter((*unix, *usual)), 0)
-    name = ("seconds", "milliseconds", "microseconds", "nanoseconds")[steps]
-    rate = f", {1000**steps / gap:.3g} frames a second" if gap else ""
-    notices.append(f"{file}: 'timestamp' is read as {name}{rate}")
-    unit_ns = 1e9 / 1000**steps
-    return [None if t is None or t * unit_ns >= MAX_STAMP_NS else round(t * unit_ns) for t in times]
 
 
 def _intrinsics(k: _Frame, size: tuple[float, float], image: Path) -> CameraIntrinsics:

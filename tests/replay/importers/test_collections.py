@@ -159,31 +159,9 @@ def test_the_largest_colmap_model_is_imported_and_the_rest_is_counted(tmp_path: 
     assert "1 picture left out, without a pose" in said(report) and "unposed.png" in said(report)
 
 
-@pytest.mark.parametrize(
-    ("first", "gap", "unit_ns", "unit"),
-    [
-        (5e9, 33_333_333, 1, "nanoseconds, 30 frames"),
-        (2e8, 33_333, 1000, "microseconds, 30 frames"),
-        (0.0, 33, 1_000_000, "milliseconds, 30.3 frames"),
-        (1.7e9, 20, 10**9, "seconds, 0.05 frames"),
-        (0.0, 0.5, 10**9, "seconds, 2 frames"),
-    ],
-)
-def test_the_unit_of_times_is_one_in_which_frames_follow_each_other(
-    tmp_path: Path, first: float, gap: float, unit_ns: int, unit: str
-) -> None:
-    folder = rec.make_transforms(tmp_path / "nerf")
-    change(folder, [{"timestamp": str(first + gap * n)} for n in range(3)])
-    report, frames = imported(folder)
-    assert np.allclose(np.diff([frame.stamp_ns for frame in frames]), gap * unit_ns, rtol=1e-6)
-    assert f"'timestamp' is read as {unit}" in said(report) and "made up" not in said(report)
-
-
 def test_frames_are_sorted_by_their_times_and_one_time_is_parted(tmp_path: Path) -> None:
-    folder = rec.make_transforms(tmp_path / "nerf")
-    change(folder, [{"timestamp": time} for time in (5.0, 4.0, 4.0)])
-    report, frames = imported(folder)
-    assert [frame.stamp_ns / 1e6 for frame in frames] == [4000, 4001, 5000] and "time of another one" in said(report)
+    report, frames = imported(rec.make_record3d(tmp_path / "phone", frameTimestamps=[5.0, 4.0, 4.0]))
+    assert [frame.stamp_ns / 1e6 for frame in frames] == [0, 1, 1000] and "time of another one" in said(report)
 
 
 @pytest.mark.parametrize(

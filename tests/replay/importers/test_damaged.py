@@ -181,7 +181,7 @@ COSTS: list[tuple[str, Edit, int, str]] = [
     ("transforms", frame(transform_matrix=None), 2, "required field `transform_matrix`"),
     ("transforms", frame(fl_x="wide"), 2, "1 frame left out"),
     ("transforms", frame(file_path="images/frame_00001.png"), 2, "1 picture left out, which are there twice"),
-    ("transforms", frame(timestamp=3.0), 3, "2 of 3 pictures have no time: stamps are made up"),
+    ("transforms", frame(timestamp=3.0), 3, "not read: 'timestamp'"),
     ("transforms", keys("transforms.json", camera={"k1": 0.1, "name": "front"}), 3, "not read: 'camera'"),
     ("transforms", text("transforms.json", "images/", "images\\\\"), 3, ""),
     ("depth", remove("depths/1.png"), 3, "1 depth image left out, missing"),
