@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
-AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
-CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 CEILING = "ceiling"  # below each colouring of the map: there, but hidden, so that one can look into a room
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
@@ -71,32 +69,27 @@ def in_ceiling(xyz: Float32, up: Float64) -> Bool:
     return np.zeros(len(xyz), np.bool_) if cut_m is None else upright[:, 2] >= cut_m
 
 
-def scale_colors(level: Float32, scale: int) -> UInt8:
-    """Colours (N, 3) of a colour map of OpenCV for levels (N,) in 0..1."""
+def scale_colors(level: Float32) -> UInt8:
+    """Colours (N, 3) for levels (N,) in 0..1."""
     steps = np.clip(level * 255 + 0.5, 0, 255).astype(np.uint8)
-    table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], scale), np.uint8)
+    table = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS), np.uint8)
     return table[:, 0, ::-1][steps]
 
 
 @rendered
-def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool, computed: float = 0.0) -> Figure:
-    """Picture of the classes of a map's points (N,), of the scales of confidence and (``aged``) age, and of what was
-    measured, where a fraction ``computed`` was not."""
+def draw_map_legend(labels: UInt8, label_set: LabelSet, computed: float = 0.0) -> Figure:
+    """Picture of the classes of a map's points (N,), of the scale of confidence, and of what was measured, where a
+    fraction ``computed`` was not."""
     rows = class_rows(labels, label_set)
     if computed:
         rows += [("measured", MEASURED_COLOR, 1 - computed), ("computed", COMPUTED_COLOR, computed)]
-    scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
-    scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
     width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
     top = _MARGIN + _CAPTION
-    figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + len(scales) * (_CAPTION + _BAR + _MARGIN))
+    figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + _CAPTION + _BAR + _MARGIN)
     put_text(place(figure, (_MARGIN, _MARGIN, width, _CAPTION)), (0, 8), "class, fraction of the map", color=DIM_TEXT)
     put_legend(figure, (_MARGIN, top, width, height), rows)
-    y = top + height + _MARGIN + _CAPTION
-    for caption, scale in scales:
-        bar = scale_colors(np.linspace(0, 1, width, dtype=np.float32), scale)
-        put_picture(figure, (_MARGIN, y, width, _BAR), bar[None], caption)
-        y += _CAPTION + _BAR + _MARGIN
+    bar = scale_colors(np.linspace(0, 1, width, dtype=np.float32))
+    put_picture(figure, (_MARGIN, top + height + _MARGIN + _CAPTION, width, _BAR), bar[None], "confidence: 0 to 1")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in five colourings, stage times.
+"""What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in four colourings, stage times.
 
 The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike; ``rerun_layout`` says
 how.
@@ -26,11 +26,8 @@ from semantic_mapper.queries.graph import HUNG_NAMES, Room, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.replay.exporters.base import CameraPath
 from semantic_mapper.replay.rerun_layout import (
-    AGE_SCALE,
-    AGED_S,
     CEILING,
     COMPUTED_COLOR,
-    CONFIDENCE_SCALE,
     MEASURED_COLOR,
     Eye,
     camera_path,
@@ -40,7 +37,7 @@ from semantic_mapper.replay.rerun_layout import (
     layout,
     scale_colors,
 )
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 
 APPLICATION = "semantic_mapper"
 IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log stays small
@@ -143,12 +140,8 @@ class RerunLog:
         for stage, value in update.stage_ms.items():
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
-    def log_map(self, points: MapPoints, age_s: Float32 | None = None) -> None:
-        """The map as it is now, in all colourings that it has something to tell in.
-
-        ``points`` are of its surface, ``age_s`` (N,) seconds since each point's surroundings last changed; None = not
-        known.
-        """
+    def log_map(self, points: MapPoints) -> None:
+        """The surface of the map as it is now, in all colourings that it has something to tell in."""
         computed = computed_fraction(points)
         for camera, path in list(self._paths.items()):
             positions = np.stack([T[:3, 3] for T in list(path.poses)])
@@ -156,20 +149,18 @@ class RerunLog:
         looks = {
             "class": {"class_ids": points.label.astype(np.uint16)},
             "colour": {"colors": points.rgb},
-            "confidence": {"colors": scale_colors(points.confidence, CONFIDENCE_SCALE)},
+            "confidence": {"colors": scale_colors(points.confidence)},
         }
         if points.measured is not None and computed:
             colors = np.array((COMPUTED_COLOR, MEASURED_COLOR), np.uint8)
             looks["measured"] = {"colors": colors[points.measured.astype(np.intp)]}
-        if age_s is not None:
-            looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
         self._look_at(points, list(looks))
         above = np.zeros(len(points.xyz), np.bool_) if self._eye is None else in_ceiling(points.xyz, self._eye.up)
         for name, look in looks.items():
             for part, kept in ("", ~above), (f"/{CEILING}", above):
                 shown = {kind: values[kept] for kind, values in look.items()}
                 self._stream.log(f"world/map/{name}{part}", rr.Points3D(points.xyz[kept], radii=self._radius, **shown))
-        legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
+        legend = draw_map_legend(points.label, self._label_set, computed)
         self._stream.log("legend", rr.Image(legend))
 
     def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = ()) -> None:

@@ -17,11 +17,11 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.map_feed import MapFollower, thinned, thinning
+from semantic_mapper.nodes.map_feed import MapFollower, thinned
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph, find_graph
-from semantic_mapper.queries.snapshot import BlockAges, MapMirror, MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.rerun_log import RerunLog
 from semantic_mapper.transport.messages import EndOfStream
@@ -63,7 +63,6 @@ class MapShow:
 
     def __init__(self, log: RerunLog) -> None:
         self._log = log
-        self._ages = BlockAges()
         self._shown: NDArray[np.int64] | None = None  # contents of the blocks
         self._graph: GraphTracker | None = None
         self._graph_at = 0.0
@@ -75,11 +74,7 @@ class MapShow:
         self._shown = snapshot.serials
         self._log.set_time(stamp_ns)
         self._show_graph(snapshot)  # it knows which way is up
-        ages_s = self._ages.follow(snapshot, stamp_ns / 1e9)
-        surface = surface_voxels(snapshot)
-        points = surface_points(snapshot, surface)
-        ages = ages_s[surface.row].astype(np.float32)[:: thinning(len(points.xyz))]
-        self._log.log_map(thinned(points), ages)
+        self._log.log_map(thinned(surface_points(snapshot, surface_voxels(snapshot))))
 
     def _show_graph(self, snapshot: MapSnapshot) -> None:
         """Rooms and things, now and then; none where lengths are not metres, or the floor is not known yet."""
@@ -125,7 +120,7 @@ class WatchedSession(RerunLog):
 
 
 def show_saved(path: Path, begin: Begin) -> None:
-    """Show a saved map; its ages are not known. Raises MapError: it cannot be read."""
+    """Show a saved map. Raises MapError: it cannot be read."""
     voxel_map = VoxelMap.load(path)
     log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
     log.note_scale(voxel_map.scale_known)

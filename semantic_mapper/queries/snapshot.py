@@ -27,7 +27,7 @@ from semantic_mapper.mapping.changes import (
     oldest_first,
 )
 from semantic_mapper.mapping.map_file import open_map
-from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Int64, UInt8
 
 if TYPE_CHECKING:
     from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -266,23 +266,3 @@ def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
             f"{where}: class ids {foreign} are not in label set '{label_set.name}'; the mirror was made for another map"
         )
     return packed
-
-
-class BlockAges:
-    """Follows the snapshots of a map; what was there in the first one counts as changed then."""
-
-    def __init__(self) -> None:
-        self._packed = np.empty(0, np.int64)
-        self._serials = np.empty(0, np.int64)
-        self._changed_s = np.empty(0, np.float64)
-
-    def follow(self, snapshot: MapSnapshot, now_s: float) -> Float64:
-        """Seconds (B,) since each block of a snapshot, later than the last one, has changed, as seen here; ``now_s`` is
-        when the map was like this, on any one clock."""
-        changed_s = np.full(snapshot.block_count, now_s)
-        if len(self._packed):
-            row = np.minimum(np.searchsorted(self._packed, snapshot.packed), len(self._packed) - 1)
-            same = (self._packed[row] == snapshot.packed) & (self._serials[row] == snapshot.serials)
-            changed_s[same] = self._changed_s[row[same]]
-        self._packed, self._serials, self._changed_s = snapshot.packed, snapshot.serials, changed_s
-        return now_s - changed_s

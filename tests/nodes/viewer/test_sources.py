@@ -1,6 +1,5 @@
 """What the viewer is shown, and who can see it and be spoken to by it."""
 
-import dataclasses
 import http.client
 import json
 import os
@@ -16,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
 import pytest
 import rerun.chunk
 
@@ -25,7 +23,6 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.viewer import server, sources
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import Live, show_live, show_saved
-from semantic_mapper.queries.snapshot import BlockAges, MapMirror
 from semantic_mapper.replay.map_log import replay_log
 from semantic_mapper.replay.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
@@ -35,7 +32,7 @@ from semantic_mapper.transport.sockets import Publisher
 from tests.nodes.foxglove.robot import update_for
 from tests.nodes.mapper.test_query_service import answering
 from tests.nodes.support import addresses_listening, error_line, eventually, is_alive, run
-from tests.queries.scene import LABELS, painted, whole_map
+from tests.queries.scene import LABELS, whole_map
 from tests.small import tiny_config, tiny_frames
 
 WARM_S = 240.0  # a service may compile kernels before it answers
@@ -130,7 +127,7 @@ def test_a_log_is_mapped_and_shown_with_all_colourings(
     camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
     assert rows[f"{camera}/rgb"] == rows[f"{camera}/semantics"] == rows[f"{camera}/depth"] == 3
     assert rows["/stage_ms/fuse"] == 3 and rows["/legend"] >= 2
-    for colouring in ("class", "colour", "confidence", "age"):
+    for colouring in ("class", "colour", "confidence"):
         assert rows[f"/world/map/{colouring}"] == rows["/legend"]
 
 
@@ -167,14 +164,14 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
     rows = logged(tmp_path / "live.rrd")
     camera = f"/world/cameras/{frames[0].camera_id}/image"
     assert 1 <= rows[f"{camera}/rgb"] <= 3 and 1 <= rows[f"{camera}/semantics"] <= 3, "the newest of what came"
-    assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
+    assert rows["/world/map/class"] == 1, "a map that has not changed is not sent again"
 
 
-def test_a_map_on_another_machine_is_shown_to_who_has_a_key_and_a_saved_one_without_ages(tmp_path: Path) -> None:
+def test_a_map_on_another_machine_is_shown_to_who_has_a_key_and_a_saved_one(tmp_path: Path) -> None:
     whole_map().save(tmp_path / "map.npz")
     show_saved(tmp_path / "map.npz", lambda: recording_file(tmp_path / "map.rrd"))
     rows = logged(tmp_path / "map.rrd")
-    assert rows["/world/map/class"] == rows["/legend"] == 1 and "/world/map/age" not in rows
+    assert rows["/world/map/class"] == rows["/legend"] == 1
     robot, desk = make_keys(tmp_path / "robot"), make_keys(tmp_path / "desk")
     allow(robot.folder, "desk", desk.public.decode())
     allow(desk.folder, "robot", robot.public.decode())
@@ -183,17 +180,4 @@ def test_a_map_on_another_machine_is_shown_to_who_has_a_key_and_a_saved_one_with
         with watching_live(live, tmp_path / "live.rrd", []) as stop:
             assert eventually(lambda: service.answered >= 4, WARM_S)
             stop.signum = signal.SIGTERM
-    assert logged(tmp_path / "live.rrd")["/world/map/age"] == 1
-
-
-def test_blocks_age_until_they_change() -> None:
-    plan = np.full((24, 8), LABELS.ids[0], np.uint8)
-    mirror, ages = MapMirror(0.05, 4.0, LABELS), BlockAges()
-    everything = painted(plan, 0, 1)
-    assert not ages.follow(mirror.apply(everything), 100.0).any()
-    middle = {name: getattr(everything, name)[1:2] for name in ("keys", "tsdf", "label", "confidence", "rgb")}
-    snapshot = mirror.apply(dataclasses.replace(everything, since=1, version=2, newest=2, **middle))
-    assert ages.follow(snapshot, 130.0).tolist() == [30.0, 0.0, 30.0]
-    assert ages.follow(snapshot, 131.0).tolist() == [31.0, 1.0, 31.0]
-    other = MapMirror(0.05, 4.0, LABELS)
-    assert ages.follow(other.apply(everything), 140.0).tolist() == [0.0, 0.0, 0.0], "a mapper that was restarted"
+    assert logged(tmp_path / "live.rrd")["/world/map/class"] == 1
