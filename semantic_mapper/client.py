@@ -207,11 +207,6 @@ class MapClient(Closing):
         """Which weights the mapper uses; ``MapError`` where it takes none while it runs (option `learner`)."""
         return self._ask(questions.WeightsRequest())
 
-    def return_to_weights(self, version: int) -> Weights:
-        """Ask the mapper to go back to weights that it has used before, which it does a moment later. Raises MapError:
-        it has never used these, or keeps them no longer."""
-        return self._ask(questions.WeightsRequest(to=version))
-
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
         with self._socket_lock:

@@ -237,7 +237,7 @@ def _live_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
         for v in weights.versions
     ]
     names = ("weights", "state", "keyframes", "file", "mIoU held out", "of those before", "reason")
-    counts = f"accepted: {weights.taken}, refused: {weights.refused}, rolled back: {weights.rolled_back}"
+    counts = f"accepted: {weights.taken}, refused: {weights.refused}"
     output.print(table(rows, names, title=f"weights {weights.in_use} in use; {counts}"))
     return found
 

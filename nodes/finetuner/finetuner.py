@@ -140,7 +140,6 @@ class Finetuner:
         self._round: FinetuneRound | None = None
         self._offer: tuple[WeightsUpdate, OnlineResult] | None = None  # until the mapper has answered
         self._last_version = 0
-        self._rolled_back = 0
         self._counts = dict.fromkeys(_COUNTERS, 0)
         self._refusal = ""  # why the last weights were refused
         self._failure = ""  # why the last round failed
@@ -182,7 +181,7 @@ class Finetuner:
             store.put_aside()
             return
         progress = store.restore(self._pool)
-        self._rolled_back, self._failures = progress.rolled_back, progress.failures
+        self._failures = progress.failures
         _log.info("taken_up", keyframes=len(self._pool), new=self._pool.new, failures=self._failures)
         if progress.learning:
             self._fail("the process before this one ended in the middle of a round")
@@ -190,7 +189,7 @@ class Finetuner:
     def _save(self) -> None:
         if self._store is None:
             return
-        progress = Progress(rolled_back=self._rolled_back, failures=self._failures, learning=self._round is not None)
+        progress = Progress(failures=self._failures, learning=self._round is not None)
         try:
             self._store.keep(self._pool.kept, progress)
             self._store_failure = ""
@@ -212,11 +211,6 @@ class Finetuner:
     def _follow(self, in_use: WeightsInUse) -> None:
         """Go on from the weights that the mapper uses now."""
         before, self._in_use = self._in_use, in_use
-        if in_use.rolled_back > self._rolled_back:
-            dropped = self._pool.return_to(in_use.version)
-            self._counts["set_aside"] += dropped
-            _log.info("rolled_back", version=in_use.version, keyframes_set_aside=dropped)
-        self._rolled_back = in_use.rolled_back
         changed = before is None or before.digest != in_use.digest
         if changed or self._current is None:
             self._current = self._find(in_use)
@@ -247,7 +241,7 @@ class Finetuner:
         """The mapper's answer to an offer. Labels are to blame only where they contradict its map."""
         reason = f"by the mapper: {in_use.reason}"
         if in_use.accepted and in_use.digest == update.digest:
-            self._pool.validate(result.keys, update.version)
+            self._pool.validate(result.keys)
             self._counts["taken"] += 1
             self._refusal = ""
         elif in_use.contradicts:
@@ -337,6 +331,6 @@ class Finetuner:
         if self._in_use is not None and self._current is None:
             warnings.append(
                 f"the mapper uses weights {self._in_use.version}, which this node does not know; start both with the "
-                "same weights, or go back to weights that it knows"
+                "same weights"
             )
         return PartStatus(counters, tuple(warnings))

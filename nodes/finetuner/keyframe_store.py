@@ -38,14 +38,13 @@ class _KeptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256 of the file
     held_out: bool
-    proved_at: Count | None = None
+    validated: bool = False
     trials: Count = 0
 
 
 class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """State of a finetuner apart from its keyframes."""
 
-    rolled_back: Count = 0  # as the mapper reported last
     failures: Count = 0  # consecutive rounds that failed
     learning: bool = False  # in the middle of a round
 
@@ -77,7 +76,7 @@ class LearningStore:
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
         """Save what has changed since the last call. ``OSError``: it cannot be written; the last state stays."""
-        files = tuple(_KeptFile(self._save(k.frame), k.held_out, k.validated_by, k.trials) for k in kept)
+        files = tuple(_KeptFile(self._save(k.frame), k.held_out, k.validated, k.trials) for k in kept)
         record = _Record(progress=progress, keyframes=files)
         if record == self._record:
             return
@@ -99,7 +98,7 @@ class LearningStore:
                 if digest_of(data) != file.digest:
                     raise CodecError("the file is damaged")
                 keyframe = decode_as(LabelledKeyframe, unpack_parts(data))
-                pool.restore(Kept(keyframe.frame, file.held_out, file.proved_at, file.trials), keyframe.label_set)
+                pool.restore(Kept(keyframe.frame, file.held_out, file.validated, file.trials), keyframe.label_set)
             except (SemanticMapperError, FileNotFoundError) as error:
                 _log.warning("keyframe_lost", file=file.digest, reason=str(error))
         return record.progress

@@ -4,13 +4,12 @@ import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import structlog
 
-from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.weights import WeightsFile
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import FieldTrial
@@ -28,8 +27,8 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 COMPARED = 4  # frames of the session, well spread, in which new weights are compared with the map
 MAX_PAUSE_S = 5.0  # the first look may compile
 MAX_FRACTION = 0.1  # of the mapper's time that looking at new weights may take; the pause after a long look is longer
-KEPT = 8  # versions whose files are kept, in addition to those that the mapper was started with
-LISTED = 64  # versions that are listed
+KEPT = 2  # versions whose files are kept: in use, and before these, as the note may still name those
+LISTED = 64  # versions that are listed, in addition to those in use and those of the start
 _WAITING = 2  # offers, of some 20 MB each
 _NOTE = "weights"  # for the process that takes over when this one is killed
 
@@ -42,18 +41,18 @@ class _Task:
 
     version: WeightsEntry
     reading: Future[WeightsFile]
-    requested: bool  # by a person, rather than offered
+    resumed: bool  # after a restart, rather than offered
     trial: FieldTrial | None = None
 
 
 def started_with(mapper: Mapper) -> Weights:
     """The weights of a mapper that takes no others."""
     entry = WeightsEntry(0, digest_of(mapper.weights_path.read_bytes()), "in use")
-    return Weights(0, None, None, 0, 0, 0, (entry,))
+    return Weights(0, 0, 0, (entry,))
 
 
 class LiveWeights(Closing):
-    """Takes, refuses and lists weights, goes back to earlier ones, and publishes which are in use. A context manager.
+    """Takes, refuses and lists weights, and publishes which are in use. A context manager.
 
     ``mapper`` is what the node was started with.
     """
@@ -65,11 +64,10 @@ class LiveWeights(Closing):
         self._least_agreement = options.min_map_agreement
         self._publisher = publisher
         self._offers = LosslessSubscriber(context.endpoint(options.learner), ("weights",), hwm=_WAITING)
-        self._lock = threading.Lock()  # of what requests see and change: versions, counts, the one requested
+        self._lock = threading.Lock()  # of what requests see: versions and counts
         self._versions = {0: WeightsEntry(0, digest_of(mapper.weights_path.read_bytes()), "in use")}
         self._in_use = 0
-        self._requested: int | None = None
-        self._counts = {"taken": 0, "refused": 0, "rolled_back": 0}
+        self._counts = {"taken": 0, "refused": 0}
         self._newest = 0
         self._answer: dict[str, Any] = {}  # to the last offer; fields of ``WeightsInUse``
         self._task: _Task | None = None
@@ -97,13 +95,6 @@ class LiveWeights(Closing):
         began = time.monotonic()
         if session is None or not session.fused or (mapped and began < self._pause_until):
             return
-        with self._lock:
-            requested, self._requested = self._requested, None
-        if requested is not None:
-            self._end_task("older ones were requested")
-            entry, start = self._versions[requested], self._mapper.weights
-            read = partial(read_kept, self._folder, requested, entry.digest, start) if requested else lambda: start
-            self._task = _Task(entry, self._reader.submit(read), requested=True)
         task = self._task
         if task is None or not task.reading.done():
             return
@@ -129,29 +120,12 @@ class LiveWeights(Closing):
             return
         self._end_task("newer ones came")
         reading = self._reader.submit(keep_offer, update, self._folder, self._mapper.weights)
-        self._task = _Task(entry, reading, requested=False)
+        self._task = _Task(entry, reading, resumed=False)
 
     def describe(self) -> Weights:
         """Which weights there are; for any thread."""
         with self._lock:
-            requested = self._requested
-            if requested is None and self._task is not None and self._task.requested:
-                requested = self._task.version.version
-            earlier = [n for n, v in self._versions.items() if v.state == "earlier" and n < self._in_use]
-            versions = tuple(self._versions.values())
-            before = max(earlier, default=None)
-            return Weights(self._in_use, before, requested, **self._counts, versions=versions)
-
-    def return_to(self, number: int) -> Weights:
-        """Request weights that were in use before; for any thread. ``MapError`` for an unknown number."""
-        with self._lock:
-            usable = [n for n, v in self._versions.items() if v.state != "refused"]
-            if number not in usable:
-                there_are = ", ".join(map(str, usable))
-                raise MapError(f"weights {number} were never in use here, or are no longer kept; there are {there_are}")
-            if number != self._in_use:
-                self._requested = number
-        return self.describe()
+            return Weights(self._in_use, **self._counts, versions=tuple(self._versions.values()))
 
     def end(self) -> Weights:
         """End the thread; unfinished weights are refused. Returns what became of all. Harmless when repeated."""
@@ -160,17 +134,19 @@ class LiveWeights(Closing):
         return self.describe()
 
     def _restore(self) -> None:
-        """After a restart, go back to the weights that were in use, as if a person had requested them."""
+        """After a restart, go back to the weights that were in use."""
         number, _, digest = self._context.note(_NOTE).partition(" ") if self._context.restarts else ("", "", "")
         if number not in ("", "0") and file_of_version(self._folder, int(number)).exists():
-            self._requested = self._newest = int(number)
-            self._versions[self._newest] = WeightsEntry(self._newest, digest, "earlier")
+            self._newest = int(number)
+            entry = self._versions[self._newest] = WeightsEntry(self._newest, digest, "earlier")
+            reading = self._reader.submit(read_kept, self._folder, self._newest, digest, self._mapper.weights)
+            self._task = _Task(entry, reading, resumed=True)
 
     def _advance(self, task: _Task, found: WeightsFile, session: MapSession) -> None:
         """One piece of the work. Errors: these weights cannot be used, which says nothing about their labels."""
         if task.trial is None:
             spread = session.snapshots[:: -(-len(session.snapshots) // COMPARED)]
-            frames = () if task.requested else tuple(snapshot.open()[0] for snapshot in spread)
+            frames = () if task.resumed else tuple(snapshot.open()[0] for snapshot in spread)
             field = make_field(found, session.pipeline.config, session.pipeline.field)
             task.trial = FieldTrial(session.pipeline, field, found.anchors, frames)
         if not task.trial.advance():
@@ -184,28 +160,25 @@ class LiveWeights(Closing):
             return
         task.trial.exchange()
         number, before = task.version.version, self._in_use
-        back = number < before
-        file = file_of_version(self._folder, number) if number else self._mapper.weights_path
-        session.follow_weights(found, file)
+        session.follow_weights(found, file_of_version(self._folder, number))
         with self._lock:
             self._task = None
             self._in_use = number
-            self._versions[before] = replace(self._versions[before], state="rolled back" if back else "earlier")
+            self._versions[before] = replace(self._versions[before], state="earlier")
             self._versions[number] = replace(task.version, state="in use")
-            self._counts["rolled_back" if back else "taken"] += 1
+            self._counts["taken"] += 1
             self._forget()
-        if not task.requested:
+        if not task.resumed:
             self._answer = {"judged": number, "accepted": True}
         then = "a mapper that replaces it begins with the weights of the last note, else with those of its start"
         self._context.try_to_leave_note(_NOTE, f"{number} {task.version.digest}", then)
-        event = "weights_rolled_back" if back else "weights_exchanged"
-        _log.info(event, version=number, before=before, agreement=agreement, score=task.version.score)
+        _log.info("weights_exchanged", version=number, before=before, agreement=agreement, score=task.version.score)
         self._report()
 
     def _end_task(self, reason: str, *, contradicts: bool = False) -> None:
         task, self._task = self._task, None
-        if task is not None and task.requested:
-            _log.error("weights_not_rolled_back", version=task.version.version, reason=reason)
+        if task is not None and task.resumed:
+            _log.error("weights_not_restored", version=task.version.version, reason=reason)
         elif task is not None:
             path = file_of_version(self._folder, task.version.version)
             task.reading.add_done_callback(lambda _: path.unlink(missing_ok=True))
@@ -221,17 +194,13 @@ class LiveWeights(Closing):
         self._report()
 
     def _forget(self) -> None:
-        """Delete the files of refused and of the oldest weights, and drop the oldest entries."""
-        usable = [n for n in sorted(self._versions) if self._versions[n].state != "refused"]
-        kept = {0, self._in_use, *usable[-KEPT:]}
-        for number in set(self._versions) - kept:
+        """Delete the files of earlier weights, and drop the oldest entries."""
+        numbers = sorted(self._versions)
+        for number in [n for n in numbers if self._versions[n].state != "refused"][:-KEPT]:
             file_of_version(self._folder, number).unlink(missing_ok=True)
-        refused = [n for n in sorted(self._versions) if self._versions[n].state == "refused"]
-        listed = kept.union(refused[-LISTED + len(kept) :])
-        self._versions = {n: v for n, v in sorted(self._versions.items()) if n in listed}
+        listed = {0, self._in_use, *numbers[-LISTED:]}
+        self._versions = {n: self._versions[n] for n in numbers if n in listed}
 
     def _report(self) -> None:
         state = (self._in_use, self._versions[self._in_use].digest, self._newest)
-        rolled_back = self._counts["rolled_back"]
-        in_use = WeightsInUse(self._context.name, *state, rolled_back=rolled_back, **self._answer)
-        self._publisher.publish(encode(in_use))
+        self._publisher.publish(encode(WeightsInUse(self._context.name, *state, **self._answer)))

@@ -289,11 +289,9 @@ class QueryService(Closing):
                 is_new = isinstance(request, questions.CorrectPosesRequest)
                 return self._correction.begin(request) if is_new else self._correction.describe()
             case questions.WeightsRequest():
-                if isinstance(self._weights, questions.Weights) and request.to is None:
-                    return self._weights
-                if not isinstance(self._weights, LiveWeights):
+                if self._weights is None:
                     raise MapError("this mapper takes no weights while it runs (option `learner`)")
-                return self._weights.describe() if request.to is None else self._weights.return_to(request.to)
+                return self._weights.describe() if isinstance(self._weights, LiveWeights) else self._weights
             case questions.PoseRequest():
                 return self._last_pose()
             case _:

@@ -120,7 +120,7 @@ class WeightsEntry:
 
     version: int  # ascending; 0 = those that it was started with
     digest: str  # SHA-256 of the file, hexadecimal
-    state: Literal["in use", "earlier", "refused", "rolled back"]  # what became of them
+    state: Literal["in use", "earlier", "refused"]  # what became of them
     # score, parent_score: Of these, and of those in use then, on the keyframes that judged them.
     score: float = 0.0
     parent_score: float = 0.0
@@ -133,12 +133,9 @@ class Weights:
     """Which weights a mapper uses, and what became of those that it was offered."""
 
     in_use: int  # version; 0 = those that it was started with
-    before: int | None  # in use before these; None where there were none
-    wanted: int | None  # about to be in use; None = nothing changes
-    # taken, refused, rolled_back: How often that has happened.
+    # taken, refused: How often that has happened.
     taken: int
     refused: int
-    rolled_back: int
     versions: tuple[WeightsEntry, ...]  # all that it knows of, the oldest first
 
 
@@ -233,10 +230,9 @@ class CorrectionRequest(Request[Correction], frozen=True, kw_only=True):
 
 
 class WeightsRequest(Request[Weights], frozen=True, kw_only=True):
-    """Which weights there are; with ``to``, go back to these. To send it twice is as to send it once."""
+    """Which weights there are."""
 
     about_map: ClassVar[bool] = False
-    to: Count | None = None
 
 
 class PoseRequest(Request[CameraPose | None], frozen=True, kw_only=True):

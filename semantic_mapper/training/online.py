@@ -47,8 +47,7 @@ class Kept:
 
     frame: PosedFrame  # with labels in the classes of the pool
     held_out: bool  # whether it is never learned from
-    # Version of the first weights that were taken after a round with it; None = none yet
-    validated_by: int | None = None
+    validated: bool = False  # whether weights were taken after a round with it
     trials: int = 0  # rounds without success since it came
 
 
@@ -69,7 +68,7 @@ class KeyframePool:
     @property
     def new(self) -> int:
         """Keyframes that have not been in a round."""
-        return sum(k.validated_by is None and not k.trials for k in self._kept.values())
+        return sum(not k.validated and not k.trials for k in self._kept.values())
 
     @property
     def kept(self) -> tuple[Kept, ...]:
@@ -96,13 +95,13 @@ class KeyframePool:
         return KeyframeSplit(
             tuple(k.frame for k in self.kept if not k.held_out),
             tuple(k.frame for k in self.kept if k.held_out),
-            frozenset(key for key, k in self._kept.items() if k.validated_by is not None),
+            frozenset(key for key, k in self._kept.items() if k.validated),
         )
 
-    def validate(self, keys: Collection[Key], version: int) -> None:
+    def validate(self, keys: Collection[Key]) -> None:
         """Weights of a round with these keyframes are in use."""
         for key in self._not_validated(keys):
-            self._kept[key] = replace(self._kept[key], validated_by=version, trials=0)
+            self._kept[key] = replace(self._kept[key], validated=True, trials=0)
 
     def reject(self, keys: Collection[Key], *, worse: bool) -> int:
         """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds, or none
@@ -110,24 +109,17 @@ class KeyframePool:
         for key in self._not_validated(keys):
             trials = MAX_TRIALS if worse else self._kept[key].trials + 1
             self._kept[key] = replace(self._kept[key], trials=trials)
-        return self._drop(lambda k: k.trials >= MAX_TRIALS)
-
-    def return_to(self, version: int) -> int:
-        """Drop what was validated by later weights alone, after a roll-back; returns how many."""
-        return self._drop(lambda k: k.validated_by is not None and k.validated_by > version)
+        before = len(self._kept)
+        self._kept = {key: kept for key, kept in self._kept.items() if kept.trials < MAX_TRIALS}
+        return before - len(self._kept)
 
     def _not_validated(self, keys: Collection[Key]) -> list[Key]:
-        return [key for key in keys if key in self._kept and self._kept[key].validated_by is None]
+        return [key for key in keys if key in self._kept and not self._kept[key].validated]
 
     def _put(self, kept: Kept) -> None:
         self._kept[key_of(kept.frame)] = kept
         if len(self._kept) > self._capacity:
             del self._kept[next(iter(self._kept))]
-
-    def _drop(self, condition: Callable[[Kept], bool]) -> int:
-        before = len(self._kept)
-        self._kept = {key: kept for key, kept in self._kept.items() if not condition(kept)}
-        return before - len(self._kept)
 
     def _translated(self, frame: PosedFrame, label_set: LabelSet) -> PosedFrame:
         where = f"keyframe seq={frame.seq} of camera '{frame.camera_id}'"

@@ -212,7 +212,6 @@ class WeightsInUse(Wire, frozen=True):
     judged: Count = 0  # the version that it was offered last; 0 = none yet
     accepted: bool = False  # whether that one was taken
     reason: Sentence = ""  # why it was not, for people
-    rolled_back: Count = 0  # how often somebody has requested other weights
     # whether it was not taken because it contradicts the map, rather than for any other reason
     contradicts: bool = False
 

@@ -91,7 +91,7 @@ def messages() -> dict[str, tuple[str, Any, dict[str, Any]]]:
         "status": ("status", Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",)), {}),
         "keyframe": ("keyframe", LabelledKeyframe(frame(), LABELS, "a person"), {}),
         "weights": ("weights", weights, {}),
-        "in_use": ("in_use", WeightsInUse("mapper", 1, "ab" * 32, 2, 2, False, "contradicts", 1, True), {}),
+        "in_use": ("in_use", WeightsInUse("mapper", 1, "ab" * 32, 2, 2, False, "contradicts", True), {}),
     }
 
 
@@ -125,7 +125,7 @@ def questions() -> dict[str, dict[str, Any]]:
             "poses": poses,
         },
         "correction": who,
-        "weights": {**who, "to": 1},
+        "weights": who,
     }
 
 
@@ -182,7 +182,7 @@ def answers() -> dict[str, Any]:
         "changes": changes,
         "correct_poses": correction,
         "correction": correction,
-        "weights": Weights(1, 0, None, 1, 2, 3, (entry,)),
+        "weights": Weights(1, 1, 2, (entry,)),
     }
 
 

@@ -60,38 +60,36 @@ def test_every_fourth_keyframe_is_held_out_for_good_and_the_oldest_goes() -> Non
     assert [f.seq for f in pool.split().held_out] == [FRAMES[3].seq] and len(pool) == 5
 
 
-def test_keyframes_are_validated_or_dropped_and_go_with_the_weights_they_were_made_for() -> None:
+def test_keyframes_are_validated_or_dropped() -> None:
     pool = pool_of(FRAMES[:4])
     first = [key_of(f) for f in FRAMES[:4]]
-    pool.validate(first, 1)
+    pool.validate(first)
     assert pool.new == 0 and pool.split().validated == set(first)
     pool.add(FRAMES[4], ROOMS)
     pool.add(FRAMES[5], ROOMS)
     assert pool.reject([*first, key_of(FRAMES[4])], worse=True) == 1 and len(pool) == 5
-    pool.validate([key_of(FRAMES[5])], 2)
-    pool.add(FRAMES[6], ROOMS)
-    assert pool.return_to(1) == 1 and pool.new == 1  # what has not been tried yet stays
+    assert pool.new == 1  # what has not been tried yet stays
     pool.add(permuted(FRAMES[0]), ROOMS)  # labelled again: not validated
     assert pool.new == 2 and key_of(FRAMES[0]) not in pool.split().validated
 
 
 def test_keyframes_of_rounds_without_success_stay_for_three_rounds() -> None:
     pool = pool_of(FRAMES[:2])
-    pool.validate([key_of(FRAMES[0])], 1)
+    pool.validate([key_of(FRAMES[0])])
     keys = [key_of(f) for f in FRAMES[:2]]
     assert [pool.reject(keys, worse=False) for _ in range(2)] == [0, 0] and (len(pool), pool.new) == (2, 0)
     pool.add(FRAMES[2], ROOMS)
     again = pool_of()
     for kept in pool.kept:
         again.restore(kept, ROOMS)
-    assert [(k.frame.seq, k.validated_by, k.trials) for k in again.kept] == [
-        (FRAMES[0].seq, 1, 0),
-        (FRAMES[1].seq, None, 2),
-        (FRAMES[2].seq, None, 0),
+    assert [(k.frame.seq, k.validated, k.trials) for k in again.kept] == [
+        (FRAMES[0].seq, True, 0),
+        (FRAMES[1].seq, False, 2),
+        (FRAMES[2].seq, False, 0),
     ]
     assert again.new == 1 and again.split().validated == {keys[0]}
     assert again.reject([*keys, key_of(FRAMES[2])], worse=False) == 1 and len(again) == 2  # the third time
-    again.validate([key_of(FRAMES[2])], 2)
+    again.validate([key_of(FRAMES[2])])
     assert again.kept[-1].trials == 0
 
 
@@ -153,7 +151,7 @@ def test_labels_that_have_nothing_to_do_with_the_images_are_refused() -> None:
 def test_labels_that_contradict_validated_ones_are_refused_although_they_agree_with_each_other() -> None:
     pool = pool_of(FRAMES[:4])
     start = learn(pool.split(), start_of(), CONFIG).checkpoint
-    pool.validate([key_of(f) for f in FRAMES[:4]], 1)
+    pool.validate([key_of(f) for f in FRAMES[:4]])
     for frame in FRAMES[4:]:
         pool.add(permuted(frame), ROOMS)
     result = learn(pool.split(), start, msgspec.structs.replace(CONFIG, least_gain=0.0))

@@ -94,7 +94,7 @@ def all_messages() -> dict[str, list[bytes]]:
         "end": encode(EndOfStream("player", "end", 200)),
         "keyframe": encode(LabelledKeyframe(make_frame(), NYU40, "a person")),
         "weights": encode(make_weights()),
-        "in_use": encode(WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees", 1, True)),
+        "in_use": encode(WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees", True)),
     }
 
 

@@ -1,4 +1,4 @@
-"""Weights are offered to a mapper over real sockets while its stream goes on: taken, refused, taken back."""
+"""Weights are offered to a mapper over real sockets while its stream goes on: taken, refused, taken up again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import MapError
 from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import NYU40, ROOMS
@@ -96,7 +95,7 @@ def misled(path: Path) -> Checkpoint:
 
 
 @pytest.mark.slow
-def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp_path):
+def test_better_weights_are_taken_between_two_frames(learned, tmp_path):
     with learning_robot(learned, tmp_path / "out") as learner:
         before = learner.in_use()
         assert (before.version, before.digest, before.judged) == (0, digest_of(learned.read_bytes()), 0)
@@ -106,27 +105,16 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
         assert learner.client.info().blocks == blocks  # what was in the map stays
         assert learner.offer(better(learned, 1), 2).version == 2
         state = learner.client.weights()
-        assert (state.in_use, state.before) == (2, 1)
-        assert [v.state for v in state.versions] == ["earlier", "earlier", "in use"]
-        learner.client.return_to_weights(1)
-        assert eventually(lambda: learner.client.weights().in_use == 1)
+        assert state.in_use == 2 and [v.state for v in state.versions] == ["earlier", "earlier", "in use"]
+        assert learner.in_use().digest == state.versions[2].digest
         said = " ".join(run_ok("info", learner.robot.query).stdout.split())
-        assert "weights 1 in use; accepted: 2, refused: 0, rolled back: 1" in said
-        state = learner.client.weights()
-        assert (state.in_use, state.before, state.rolled_back) == (1, 0, 1)
-        assert [v.state for v in state.versions] == ["earlier", "in use", "rolled back"]
-        assert learner.in_use().rolled_back == 1 and learner.in_use().digest == state.versions[1].digest
-        assert learner.client.return_to_weights(2).wanted == 2  # and forward again
-        assert eventually(lambda: learner.client.weights().in_use == 2)
-        for version, says in ((7, "never in use here"), (3, "there are 0, 1, 2")):
-            with pytest.raises(MapError, match=says):
-                learner.client.return_to_weights(version)
+        assert "weights 2 in use; accepted: 2, refused: 0" in said
         learner.robot.send([FRAMES[6], FRAMES[7]])
         assert learner.robot.fused(8)
         assert eventually(lambda: learner.robot.status[-1].counters.get("weights_version") == 2)
         summary = learner.robot.end(8)
     told = summary["weights"]
-    assert told["learned"]["in_use"] == 2 and told["learned"]["rolled_back"] == 1
+    assert told["learned"]["in_use"] == 2 and told["learned"]["taken"] == 2
     assert told["file"] == "000002.safetensors" and (tmp_path / "out" / "weights" / told["file"]).exists()
     # Frames 0 to 3 had been learned from, 4 and 5 were scored before they were, 6 and 7 never were.
     assert summary["frames"]["scored"] == 4 and summary["frames"]["excluded_from_scores"] == 4
@@ -170,8 +158,6 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
         assert eventually(lambda: not learner.robot.status[-1].degraded)
         states = {v.version: v.state for v in learner.client.weights().versions}
         assert states == {0: "earlier", **dict.fromkeys(range(1, 9), "refused"), 9: "in use"}
-        with pytest.raises(MapError, match="never in use"):
-            learner.client.return_to_weights(3)
         learner.robot.end(6)
     assert [p.name for p in (tmp_path / "out" / "weights").iterdir()] == ["000009.safetensors"]
 
@@ -188,5 +174,5 @@ def test_a_restarted_mapper_goes_on_with_the_weights_that_its_forerunner_used(le
     with learning_robot(learned, tmp_path / "out", context={"folder": notes, "restarts": 1}) as learner:
         assert eventually(lambda: learner.in_use().version == 3)
         assert (learner.in_use().digest, learner.in_use().newest) == (digest, 3)
-        assert learner.client.weights().before == 0
+        assert [v.state for v in learner.client.weights().versions] == ["earlier", "in use"]
         learner.robot.end(6)
