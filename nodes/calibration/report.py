@@ -17,6 +17,7 @@ from semantic_mapper.drivers.calibrating.views import CELLS, CalibrationConfig, 
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.geometry import rotation_vector
+from semantic_mapper.nodes.console import table
 
 _WORST = 3  # views named in the tables
 
@@ -87,32 +88,31 @@ def tables(plain: dict[str, Any]) -> Iterator[Table]:
     """What ``as_json`` tells, for people."""
     for name, camera in plain["cameras"].items():
         width, height = camera["size"]
-        table = Table(title=f"{name}, {width} x {height}", title_justify="left", show_header=False)
-        table.add_column()
-        table.add_column(overflow="fold")
         images, errors, left_out = camera["images"], camera["errors_px"], camera["images"]["left_out"]
         used = f"{len(errors)} used" + (f"; {len(left_out)} did not fit: {', '.join(left_out)}" if left_out else "")
-        table.add_row("images", f"{images['looked_at']} looked at, {images['with_board']} with the board, {used}")
-        table.add_row("error", f"{camera['rms_px']:.3f} px RMS")
         worst = sorted(errors.items(), key=lambda item: -item[1])[:_WORST]
-        table.add_row("worst images", ", ".join(f"{view} {error:.2f} px" for view, error in worst))
+        rows = [
+            ("images", f"{images['looked_at']} looked at, {images['with_board']} with the board, {used}"),
+            ("error", f"{camera['rms_px']:.3f} px RMS"),
+            ("worst images", ", ".join(f"{view} {error:.2f} px" for view, error in worst)),
+        ]
         for key in ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES):
             if key in camera:
                 sigma = f" +- {camera['sigmas'][key]:.2g}" if camera["estimated"] else " as the source gives it"
-                table.add_row(key, f"{camera[key]:.{5 if key in COEFFICIENT_NAMES else 2}f}{sigma}")
+                rows.append((key, f"{camera[key]:.{5 if key in COEFFICIENT_NAMES else 2}f}{sigma}"))
         missing = f"; hardly: {', '.join(camera['hardly_seen'])}" if camera["hardly_seen"] else ""
-        table.add_row("image area seen", f"{camera['cells_seen']} of {camera['cells']} cells{missing}")
+        rows.append(("image area seen", f"{camera['cells_seen']} of {camera['cells']} cells{missing}"))
         up, side = camera["leaned_deg"]
-        table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
-        yield table
+        rows.append(("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side"))
+        yield table(rows, title=f"{name}, {width} x {height}")
     if plain["rig"] is not None:
         caption = f"{plain['rig']['rms_px']:.3f} px RMS of all corners at once"
         titles = ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg")
-        table = Table(*titles, title="rig", title_justify="left", caption=caption)
+        rows: list[tuple[object, ...]] = []
         for name, place in plain["rig"]["cameras"].items():
             T = np.array(place["T_rig_camera"])
             position = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
             turned = np.degrees(np.linalg.norm(rotation_vector(T)))
             sigmas = f"{1000 * place['position_sigma_m']:.2f}", f"{place['turn_sigma_deg']:.3f}"
-            table.add_row(name, str(place["moments"]), position, sigmas[0], f"{turned:.2f}", sigmas[1])
-        yield table
+            rows.append((name, place["moments"], position, sigmas[0], f"{turned:.2f}", sigmas[1]))
+        yield table(rows, titles, title="rig", caption=caption)

@@ -1,5 +1,6 @@
 """Which frames to label, with which classes, and which labelled ones to send to a finetuner."""
 
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,15 +11,33 @@ from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.nodes.console import Output, frame_progress, table
+from semantic_mapper.nodes.labeller.server import LabelServer, LabelSession
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.finetune_log import FinetuneRequest, FrameSource
 from semantic_mapper.replay.importers.folder import read_label_set
 from semantic_mapper.replay.job_monitor import JobMonitor
-from semantic_mapper.replay.label_folder import LABELS_FILE, LabelFolder, open_label_folder, read_classes
+from semantic_mapper.replay.label_folder import (
+    LABELS_FILE,
+    LabelFolder,
+    make_label_folder,
+    open_label_folder,
+    read_classes,
+)
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.training.select import Candidate, candidate_from_frame, suggest_frames
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.launches import socket_in_launch
+from semantic_mapper.transport.messages import LabelledKeyframe
+from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import PosedFrame
 
 MAX_CANDIDATES = 1000  # frames that are looked at, evenly spread over a longer log
+POLL_S = 0.2
+LABELS = "labels"  # what launch files call the socket where keyframes come; see ``FinetunerOptions.labels``
+DELIVERY_MS = 60_000  # that the last keyframes may take to be read, after which they are lost
+FINETUNER_S = 30.0  # how long the finetuner may take to be there
 
 _log = structlog.get_logger(__name__)
 
@@ -28,6 +47,60 @@ class Suggested(NamedTuple):
 
     frames: list[dict[str, Any]]
     labelled: list[int]
+
+
+def suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None) -> None:
+    """Say which frames of a log to label next."""
+    if images is not None and not images.is_dir():
+        raise LogError(f"--images {images}: no such folder")
+    with StopRequest() as stop, frame_progress("suggest", None, stop=stop) as bar, open_log(log) as opened:
+        found = suggest_for_log(opened, count, open_images(images, opened), weights, bar)
+    if found.frames:
+        rows = [
+            (frame["number"], *("" if frame[key] is None else f"{100 * frame[key]:.1f} %" for key in ("gain", "shown")))
+            for frame in found.frames
+        ]
+        output.print(table(rows, ("frame", "adds", "shown then")))
+        if all(frame["gain"] is None for frame in found.frames):
+            output.print("the frames have no depth that says what they show: these are spread evenly over time")
+    else:
+        output.print(f"{log.name}: its {counted(len(found.labelled), 'labelled frame')} show all that it shows")
+    output.json({"log": str(log), "labelled": found.labelled, "frames": found.frames})
+
+
+def serve(
+    output: Output, log: Path, count: int, out: Path, classes: Path | None, weights: Path | None, port: int
+) -> None:
+    """Open the page to paint labels, until a stop request."""
+    with StopRequest() as stop, open_log(log) as opened:
+        folder = make_label_folder(out, opened, choose_classes(opened, out, classes, weights))
+        with frame_progress("suggest", None, stop=stop) as bar:
+            found = suggest_for_log(opened, count, open_images(out, opened), weights, bar)
+        # Suggested frames in their order, then those that have labels already.
+        order = list(dict.fromkeys([*(frame["number"] for frame in found.frames), *folder.numbers()])) or [0]
+        with LabelServer(LabelSession(opened, folder, order), port) as server:
+            output.print(f"label at {server.url}")
+            output.print(
+                f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out} --strokes`"
+            )
+            while not stop:
+                time.sleep(POLL_S)
+        output.print(f"{out}: {counted(len(folder.numbers()), 'labelled frame')} of {log.name}")
+
+
+def send(output: Output, log: Path, keyframes: int, images: Path | None, to: str) -> None:
+    """Send labelled frames to a running finetuner."""
+    endpoint = socket_in_launch(to, LABELS)
+    with StopRequest() as stop, frame_progress("label", None, stop=stop) as bar:
+        found, label_set = choose_keyframes(log, keyframes, images, bar)
+        with Publisher(endpoint, policy="block", linger_ms=DELIVERY_MS) as publisher:
+            if not publisher.wait_for_subscribers("keyframe", 1, FINETUNER_S, stop):
+                raise KeyboardInterrupt
+            for frame in found.values():
+                publisher.publish(encode(LabelledKeyframe(frame, label_set, f"log {log.name}")))
+    output.print(f"{counted(len(found), 'labelled keyframe')} sent: frames {', '.join(map(str, found))} of {log.name}")
+    if pseudo := sum(frame.label_is_pseudo for frame in found.values()):
+        output.print(f"  {pseudo} of them have pseudo labels (`autolabel`): what weights have rendered, right or wrong")
 
 
 def suggest_for_log(
