@@ -8,19 +8,11 @@ import numpy as np
 
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40
-from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.images import CodecOptions, depth_from_uint16
-from semantic_mapper.transport.messages import (
-    EndOfStream,
-    FrameRefused,
-    LabelledKeyframe,
-    Status,
-    StreamInfo,
-    WeightsInUse,
-    WeightsUpdate,
-    digest_of,
-)
+from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+from tests.contract import samples as contract
 
 INTRINSICS = CameraIntrinsics(20.5, 21.0, 11.5, 8.5, 24, 18)
 CAMERA = "front"
@@ -74,35 +66,9 @@ def make_info() -> StreamInfo:
     return StreamInfo("folder kitchen", {CAMERA: INTRINSICS}, NYU40, 200, 6.0, {"place": "Küche"})
 
 
-def make_status() -> Status:
-    return Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("the GPU is gone; running on the CPU",))
-
-
-def make_weights() -> WeightsUpdate:
-    data = b"safetensors" * 9
-    return WeightsUpdate("learner", 2, data, digest_of(data), "cd" * 32, 0.8, 0.5, 9, 3)
-
-
 def all_messages() -> dict[str, list[bytes]]:
-    """One encoded message of each topic."""
-    return {
-        "frame": encode_frame(make_frame()),
-        "map": encode(make_update()),
-        "refused": encode(FrameRefused(4, 5, CAMERA, "pose holds NaN")),
-        "status": encode(make_status()),
-        "info": encode(make_info()),
-        "end": encode(EndOfStream("player", "end", 200)),
-        "keyframe": encode(LabelledKeyframe(make_frame(), NYU40, "a person")),
-        "weights": encode(make_weights()),
-        "in_use": encode(WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees", True)),
-    }
-
-
-def frame_variants() -> list[list[bytes]]:
-    """Frames in every packing."""
-    options = [CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg", depth_scale=999.0)]
-    frames = [make_frame(), make_frame(depth=False), make_frame(label=False), make_frame(depth=False, label=False)]
-    return [encode_frame(frame, option) for option in options for frame in frames]
+    """Messages of each topic, and frames in every packing."""
+    return {name: encode(message, CodecOptions(**more)) for name, (_, message, more) in contract.messages().items()}
 
 
 def with_header(parts: Sequence[bytes], **changes: object) -> list[bytes]:

@@ -141,7 +141,7 @@ def test_a_keyframe_survives_and_what_cannot_be_learned_from_is_refused() -> Non
         decode([*parts[:2], *encode_frame(samples.make_frame(label=False))[1:]])
     with pytest.raises(CodecError, match="has no frame"):
         decode(parts[:2])
-    weights = encode(samples.make_weights())
+    weights = samples.all_messages()["weights"]
     other = bytes([weights[2][0] ^ 1]) + weights[2][1:]
     for bad, says in (
         ([*weights[:2], other], "not the one that its digest names"),
@@ -234,7 +234,7 @@ def test_bombs_in_buffers_are_refused_before_they_unfold() -> None:
 
 def test_thousands_of_random_and_mutated_messages_raise_nothing_but_codec_errors() -> None:
     rng = random.Random(0)
-    good = [*samples.all_messages().values(), *samples.frame_variants()]
+    good = list(samples.all_messages().values())
     refused = 0
     for _ in range(5_000):
         if rng.random() < 0.2:
