@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The quick tests of the last commit with other Pythons, and with the oldest packages that pyproject.toml allows and the
 # newest: tools/test_matrix.sh 3.12 3.13. A row each in runs/matrix/results.md; what has passed at this commit is not
-# run again.
+# run again. An environment takes up to 10 GB of disk; that of a row that has passed is removed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export UV_HTTP_TIMEOUT="${UV_HTTP_TIMEOUT:-300}" UV_PYTHON_DOWNLOADS=never
@@ -28,6 +28,7 @@ for python in "$@"; do
     (set -e; try "$python" "$resolution") >"$log" 2>&1
     outcome=$([[ $? == 0 ]] && echo passed || echo failed)
     set -e
+    [[ $outcome == failed ]] || rm -rf "runs/matrix/$python-$resolution"
     echo "| $revision | $python | $resolution | $outcome | $(tail -n 1 "$log") |" | tee -a "$results"
   done
 done

@@ -90,7 +90,7 @@ def compare_peers(
     """Run each peer ``repeats`` times over frames of one camera, in an order that ``seed`` shuffles, on one core.
 
     ``truth`` is a mesh (``read_mesh``) for the surfaces; ``pythons`` are interpreters of peers that have an
-    environment of their own. Raises MapError: the mesh cannot be read.
+    environment of their own. Raises MapError: the mesh cannot be read. LogError: no room for the frames.
 
     Gives plain data, in ``peers`` a row for each: ``cpu_ms`` of the process a frame (the mean over frames; median,
     least and largest of the repeats), ``loaded_mb`` with the frames and ``peak_mb`` at the end, and of mappers
@@ -175,10 +175,15 @@ def draw_peers(found: Mapping[str, Any]) -> Figure:
 def _write(folder: Path, frames: Sequence[PosedFrame], depth_max_m: float) -> None:
     depth = np.stack([np.asarray(frame.depth_m, np.float32) for frame in frames])
     depth[~((depth > 0) & (depth <= depth_max_m))] = 0  # NaN, too
-    np.save(folder / "depth.npy", depth)
-    np.save(folder / "rgb.npy", np.stack([frame.rgb for frame in frames]))
-    np.save(folder / "poses.npy", np.stack([frame.T_world_camera for frame in frames]))
-    np.save(folder / "stamps.npy", [frame.stamp_ns for frame in frames])
+    try:
+        np.save(folder / "depth.npy", depth)
+        np.save(folder / "rgb.npy", np.stack([frame.rgb for frame in frames]))
+        np.save(folder / "poses.npy", np.stack([frame.T_world_camera for frame in frames]))
+        np.save(folder / "stamps.npy", [frame.stamp_ns for frame in frames])
+    except OSError as error:
+        raise LogError(
+            f"{folder}: the frames cannot be written: {error}; free some space, or name another folder (TMPDIR)"
+        ) from error
 
 
 def _run(folder: Path, job: Mapping[str, Any], python: str) -> dict[str, Any]:

@@ -60,19 +60,20 @@ class PlaceStore:
     Any thread may call it. What needs a place that is in the making waits for it: all is as if it had been added."""
 
     def __init__(self, places: Iterable[Place] = (), capacity: int = MAX_PLACES) -> None:
-        self._places: list[Place | Future[Place]] = list(places)  # the last one may be in the making
-        self._poses = [place.T_world_camera for place in self._made()]
+        self._known = list(places)
+        self._making: Future[Place] | None = None  # the newest
+        self._poses = [place.T_world_camera for place in self._known]  # and of the newest
         self._capacity = capacity
         self._lock = Lock()
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._poses)
 
     @property
     def places(self) -> tuple[Place, ...]:
         """All, oldest first."""
         with self._lock:
-            return self._made()
+            return tuple(self._made())
 
     def wants(self, T_world_camera: Float64) -> bool:
         """Whether a view from this pose is a new place."""
@@ -82,37 +83,40 @@ class PlaceStore:
     def add(self, place: Place) -> None:
         """Keep a place."""
         with self._lock:
-            self._keep(place, place.T_world_camera)
+            self._made().append(place)
+            self._note(place.T_world_camera)
 
     def add_soon(self, T_world_camera: Float64, make: Callable[[], Place]) -> None:
         """Keep the place of a pose, which a thread makes while the caller goes on; its error comes at the next call."""
         with self._lock:
-            self._keep(_maker.submit(make), T_world_camera)
+            self._made()
+            self._making = _maker.submit(make)
+            self._note(T_world_camera)
 
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> None:
         """Give places other poses, by (camera_id, stamp_ns); those that are not named stay where they are."""
         with self._lock:
             moved = [(p, poses.get((p.camera_id, p.stamp_ns))) for p in self._made()]
-            self._places = [p if pose is None else replace(p, T_world_camera=pose.copy()) for p, pose in moved]
-            self._poses = [p.T_world_camera for p in self._made()]
+            self._known = [p if pose is None else replace(p, T_world_camera=pose.copy()) for p, pose in moved]
+            self._poses = [p.T_world_camera for p in self._known]
 
-    def _made(self) -> tuple[Place, ...]:
-        try:
-            made = tuple(p.result() if isinstance(p, Future) else p for p in self._places)
-        except BaseException:
-            del self._places[-1], self._poses[-1]
-            raise
-        self._places[:] = made
-        return made
+    def _made(self) -> list[Place]:
+        """All, when the newest is made."""
+        if self._making is not None:
+            if (error := self._making.exception()) is not None:
+                self._making = None
+                del self._poses[-1]
+                raise error
+            self._known.append(self._making.result())
+            self._making = None
+        return self._known
 
-    def _keep(self, place: Place | Future[Place], T_world_camera: Float64) -> None:
-        self._made()
-        self._places.append(place)
+    def _note(self, T_world_camera: Float64) -> None:
         self._poses.append(T_world_camera)
-        if len(self._places) > self._capacity:
+        if len(self._poses) > self._capacity:
             poses = np.stack(self._poses[:-1])  # never the newest
             one = most_crowded(_apart(poses[:, None], poses[None]))[1]
-            del self._places[one], self._poses[one]
+            del self._known[one], self._poses[one]
 
 
 def view_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
