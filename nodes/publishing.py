@@ -74,11 +74,6 @@ class PublicPublisher(Publisher):
                 self._public.close()
             raise
 
-    @property
-    def public_endpoint(self) -> str:
-        """The second endpoint as ZeroMQ names it; empty = none."""
-        return "" if self._public is None else self._public.endpoint
-
     def publish(self, parts: Sequence[Buffer], timeout_s: float = 30.0) -> None:
         """As of ``Publisher``."""
         super().publish(parts, timeout_s)

@@ -20,7 +20,7 @@ from semantic_mapper.transport.keys import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from tests.nodes.mapper.test_query_service import a_folder
-from tests.nodes.support import node_here, summary_of
+from tests.nodes.support import free_port, node_here, summary_of
 from tests.small import INTRINSICS, tiny_frames
 
 LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right eye", {"right": INTRINSICS})
@@ -109,18 +109,17 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
         own = f"ipc://{folder}/mapper"
         with pytest.raises(TransportError, match="needs keys on both sides"):
             PublicPublisher(own, "tcp://0.0.0.0:*", "")
-        with PublicPublisher(own, "tcp://0.0.0.0:*", str(tmp_path / "robot")) as publisher:
-            port = publisher.public_endpoint.rpartition(":")[2]
-            far = f"tcp://127.0.0.1:{port}"
-            with (
-                LosslessSubscriber(own, ("status",)) as near,
-                LosslessSubscriber(far, ("status",), identity=ServerIdentity(desk, "robot")) as peer,
-                LosslessSubscriber(far, ("status",)) as stranger,
-            ):
-                near.wait_until_heard(20)
-                peer.wait_until_heard(20)
-                publisher.publish(encode(status))
-                assert near.receive(20) == peer.receive(20) == status
-                assert stranger.receive(0.2) is None
-        with PublicPublisher(own, "", "") as plain:  # free again
-            assert plain.public_endpoint == ""
+        port = free_port()
+        far = f"tcp://127.0.0.1:{port}"
+        with (
+            PublicPublisher(own, f"tcp://0.0.0.0:{port}", str(tmp_path / "robot")) as publisher,
+            LosslessSubscriber(own, ("status",)) as near,
+            LosslessSubscriber(far, ("status",), identity=ServerIdentity(desk, "robot")) as peer,
+            LosslessSubscriber(far, ("status",)) as stranger,
+        ):
+            near.wait_until_heard(20)
+            peer.wait_until_heard(20)
+            publisher.publish(encode(status))
+            assert near.receive(20) == peer.receive(20) == status
+            assert stranger.receive(0.2) is None
+        PublicPublisher(own, "", "").close()  # free again
