@@ -317,6 +317,16 @@ class MovingConfig(Config, frozen=True):
     classes: bool = False  # where the rendered class moves by itself (``labels.MOVING_NAMES``)
 
 
+class SegmenterConfig(Config, frozen=True):
+    """A network that has seen photographs, beside the field (``mapping/segmenter.py``)."""
+
+    # Its table (.toml), beside an ONNX or OpenVINO model; "" = none. Its classes join the labels and votes of frames,
+    # its people and vehicles are among what ``moving.classes`` leaves out
+    table: str = ""
+    # Frames from one that it is shown to the next; those between take its answer over by depth
+    every_n_frames: AtLeastOne = 8
+
+
 class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
@@ -327,6 +337,7 @@ class MapperConfig(Config, frozen=True):
     history: HistoryConfig = HistoryConfig()
     virtual: VirtualViewConfig = VirtualViewConfig()
     moving: MovingConfig = MovingConfig()
+    segmenter: SegmenterConfig = SegmenterConfig()
     render: RenderConfig = RenderConfig()
     quality: Quality = "custom"  # few, some or all rays; "custom": as set
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0  # of everything that is drawn at random

@@ -45,9 +45,7 @@ class ImageNetwork:
         self.size = (size[0] + 1) // 2, (size[1] + 1) // 2
         self._with_depth = with_depth
         model = _Builder(tensors, config).build(size, self.size, with_depth=with_depth)
-        threads = {"INFERENCE_NUM_THREADS": thread_count(), "ENABLE_CPU_PINNING": False}
-        exact = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
-        self._request = _core().compile_model(model, "CPU", threads | exact).create_infer_request()
+        self._request = compile_request(model)
 
     def encode(self, rgb: UInt8, maps: Float32 | None, depth_m: Float32, spread: Float32, focal: float) -> EncodedImage:
         """Encode an image (H, W, 3).
@@ -65,8 +63,15 @@ def check_networks(tensors: Mapping[str, Array], config: SRayConfig) -> None:
         _Builder(tensors, config).build((64, 64), (32, 32), with_depth=with_depth)
 
 
+def compile_request(model: ov.Model) -> Any:
+    """A request of a network for the CPU, in float32, with as many threads as kernels have."""
+    threads = {"INFERENCE_NUM_THREADS": thread_count(), "ENABLE_CPU_PINNING": False}
+    exact = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+    return core().compile_model(model, "CPU", threads | exact).create_infer_request()
+
+
 @cache
-def _core() -> ov.Core:
+def core() -> ov.Core:
     """One for the process: a core gives the thread that first compiles a stack for signals, and takes it back when it
     is deleted; deleted by another thread, it leaves the first one a stack that is gone, on which the next signal ends
     the process."""

@@ -93,25 +93,21 @@ class MovingSpace:
 
 class MovingFilter:
     """Finds what moves, for one map; ``pixels`` were left out so far, ``space`` is where that was within the last
-    second. ``ConfigError``: ``moving.classes``, and none of the classes moves."""
+    second. ``sees_moving``: a segmenter does. ``ConfigError``: ``moving.classes``, and none of the classes moves."""
 
-    def __init__(self, config: MapperConfig, label_set: LabelSet) -> None:
+    def __init__(self, config: MapperConfig, label_set: LabelSet, *, sees_moving: bool = False) -> None:
         self._config = config.moving
         self._motion = MotionDetector(config.voxel_map.depth_max_m)
         moving = [i for i, name in zip(label_set.ids, label_set.names, strict=True) if name in MOVING_NAMES]
         self._ids = moving if config.moving.classes else []
-        if config.moving.classes and not self._ids:
+        self.uses_classes = config.moving.classes  # of the map, or of a segmenter
+        if config.moving.classes and not self._ids and not sees_moving:
             raise ConfigError(
                 f"moving.classes: none of the classes of '{label_set.name}' moves ({', '.join(sorted(MOVING_NAMES))} "
-                "would); use weights that know one (`rooms-people` ship), or moving.motion"
+                "would); use weights that know one (`rooms-people` ship), a segmenter, or moving.motion"
             )
         self.pixels = 0
         self.space = MovingSpace()
-
-    @property
-    def uses_classes(self) -> bool:
-        """Whether classes of the map move by themselves."""
-        return bool(self._ids)
 
     def find(self, frame: PosedFrame) -> Bool | None:
         """Pixels (H, W) of what moves by depth; None where nothing is looked for: a sensor has to have measured it."""

@@ -42,6 +42,7 @@ from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingFilter
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.rendering import RenderedView, ViewRenderer, add_own_image, likeliest, upsample
+from semantic_mapper.mapping.segmenter import Opinion, Segmenter
 from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualView, add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int32, MapUpdate, PosedFrame, UInt8
@@ -91,7 +92,8 @@ class MappingPipeline:
         self.picture_check = self.frame_depth.pictures
         self.domain_check: DomainCheck | None = None  # where it is known what the weights learned from
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
-        self.moving = MovingFilter(config, label_set)
+        self._segmenter = Segmenter(config.segmenter, label_set) if config.segmenter.table else None
+        self.moving = MovingFilter(config, label_set, sees_moving=self._segmenter is not None and self._segmenter.moves)
         self.last_pose: CameraPose | None = None
         self._viewpoints = ViewpointChooser(config.seed)
         self._renderer = ViewRenderer(field, config.render, config.sampling)
@@ -121,11 +123,12 @@ class MappingPipeline:
                 if self.domain_check is not None:
                     self.domain_check.note()
                 sources = self._timed("choose", self._choose_sources, views, current, self.keyframes)
-                view, votes = self._timed("render", self._render_semantics, views, sources, current)
+                opinion = self._timed("segment", self._look, views) if self._segmenter else None
+                view, votes = self._timed("render", self._render_semantics, views, sources, current, opinion)
             finally:
                 moving = self._timed("motion", finding.result)
             # From here on without what moves (``full.views``): it is published, but neither fused nor kept.
-            full = self._timed("upsample", self._upsample_still, views, votes, moving)
+            full = self._timed("upsample", self._upsample_still, views, votes, moving, opinion)
             touched = self._timed("fuse", self._fuse, self.voxel_map, full, votes)
             if self.corrector.records:
                 self._timed("history", self.corrector.record, full.views.frame, votes)
@@ -250,11 +253,20 @@ class MappingPipeline:
         """Source views as they are rendered from, the frame itself among them where the settings say so."""
         return [*(k.encoded for k in sources), *([current] if self.config.keyframes.use_current_view else [])]
 
+    def _look(self, views: FrameViews) -> Opinion:
+        """What the segmenter says of a frame, at the pixels (h, w) that are rendered."""
+        assert self._segmenter is not None
+        k, scale = views.frame.intrinsics, self.config.render.scale
+        return self._segmenter.look(views, scale_intrinsics(k, round(k.width * scale), round(k.height * scale)))
+
     def _render_semantics(
-        self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded
+        self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded, opinion: Opinion | None
     ) -> tuple[RenderedView, RenderedView]:
-        """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself."""
+        """The coarse view (h, w) as it is rendered, with the segmenter's opinion where there is one, and with what the
+        frame's image says by itself."""
         view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
+        if opinion is not None:
+            view = opinion.join(view)
         keyframes = self.config.keyframes
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
         return view, add_own_image(view, self.field, current, weight)
@@ -296,7 +308,9 @@ class MappingPipeline:
             return depth
         return fill_holes(self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m)
 
-    def _upsample_still(self, views: FrameViews, votes: RenderedView, moving: Bool | None) -> _FullSize:
+    def _upsample_still(
+        self, views: FrameViews, votes: RenderedView, moving: Bool | None, opinion: Opinion | None
+    ) -> _FullSize:
         """The view at full size, without what moves by depth or by class."""
         if moving is None:
             return self._upsample(views, votes, self.voxel_map)
@@ -304,6 +318,8 @@ class MappingPipeline:
         if self.moving.uses_classes:
             label, _ = self._at_rows(votes, full.rows)
             by_class = self.moving.of_classes(label)
+            if opinion is not None:
+                by_class |= np.append(opinion.moving, False)[full.rows]
             if (by_class & ~moving).any():
                 moving = moving | by_class
                 full = self._upsample(self.moving.leave_out(views, moving), votes, self.voxel_map)

@@ -1,0 +1,249 @@
+"""A second opinion of what a frame shows: a network for single images that has learned from photographs.
+
+Any model in ONNX, or OpenVINO's IR, beside a table that says how pictures are put in and what its classes are here. It
+is no vote of its own: for a class c of the map, P(answer | c) is 1 - ``miss`` where the answer is c, ``false_alarm``
+where it is another class of the map, the rest where it is none of these; for a class that the model lacks likewise.
+The rendered probability of c times the expected likelihood of the model's answer, to the power ``weight``, is the joint
+one (Bayes' rule, with errors of the two taken for independent). A model that misses most tables thereby says little
+where it sees none, and much where it sees one.
+
+Every n-th frame is shown to the model. Frames between take the answer over where their depth, and the pose, lead to the
+surface that the answer was about; elsewhere there is none.
+"""
+
+# OpenVINO leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import cv2
+import msgspec
+import numpy as np
+
+from semantic_mapper.config import Config, Fraction, Positive, SegmenterConfig, load_config, nearest, nearest_path
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.inference import compile_request, core
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
+from semantic_mapper.imaging import FrameViews
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.rendering import RenderedView
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, UInt8
+
+STEP = 32  # pixels by which the sides of pictures differ, where the model takes any: networks halve five times
+MARGIN_M, MARGIN_PER_M = 0.05, 0.02  # between depth of two frames that is one surface
+MOVES = 0.5  # probability of classes that move from which on a pixel is one of them
+MOST_CLASSES = 4096
+
+Triple = tuple[float, float, float]
+
+
+class SegmenterTable(Config, frozen=True):
+    """What the table beside a model says."""
+
+    model: str  # file, beside the table
+    width: Annotated[int, msgspec.Meta(ge=STEP, le=4096)]  # of the longer side of pictures, for a model of any size
+    # in the order of the outputs
+    classes: Annotated[tuple[str, ...], msgspec.Meta(min_length=2, max_length=MOST_CLASSES)]
+    names: dict[str, str] = msgspec.field(
+        default_factory=dict
+    )  # class of ours by the model's; others are none of these
+    moving: tuple[str, ...] = ()  # classes of the model that ``moving.classes`` leaves out of the map
+    channels: Literal["rgb", "bgr"] = "rgb"
+    mean: Triple = (0.0, 0.0, 0.0)  # the input is (value - mean) * scale, of values 0 to 255
+    scale: Triple = (1.0, 1.0, 1.0)
+    output: Literal["logits", "probabilities"] = "logits"
+    temperature: Positive = 1.0  # that logits are divided by
+    miss: Fraction = 0.5  # of pixels of a class of ours: those that the model gives to none
+    false_alarm: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.02  # of pixels of other classes: those given to one
+    weight: Fraction = 1.0
+    source: str = ""  # where the model is from, for people
+    licence: str = ""
+    sha256: str = ""  # of the model's file; checked where there is one
+
+    def __post_init__(self) -> None:
+        for where, given in (("names", self.names), ("moving", self.moving)):
+            for name in given:
+                if name not in self.classes:
+                    raise ValueError(f"{where}: the model has no class '{name[:80]}'{nearest(name[:80], self.classes)}")
+
+
+class _Answer(NamedTuple):
+    """What the model said of one frame."""
+
+    likelihood: Float32  # (h, w, G + 1) of groups of classes, and the probability that the pixel moves
+    depth_m: Float32  # (h, w)
+    intrinsics: CameraIntrinsics  # of (h, w)
+    T_world_camera: Float64
+
+
+class Opinion(NamedTuple):
+    """What is known of a frame at its coarse pixels (h, w)."""
+
+    likelihood: Float32  # (h, w, G), 1 where there is no answer
+    group: tuple[int, ...]  # of each of the L classes
+    moving: Bool  # (h, w)
+
+    def join(self, view: RenderedView) -> RenderedView:
+        """The view (h, w) with the joint probabilities."""
+        joint = view.probabilities * self.likelihood[..., self.group]
+        joint /= np.maximum(joint.sum(axis=2, keepdims=True), np.float32(1e-12))
+        return view._replace(probabilities=joint)
+
+
+class Segmenter:
+    """A model and the answer that it gave last. Deterministic.
+
+    Raises ConfigError: the table or the model is missing or invalid, or none of its classes is in ``label_set`` and
+    none moves."""
+
+    def __init__(self, config: SegmenterConfig, label_set: LabelSet) -> None:
+        path = Path(config.table)
+        self.table = table = load_config(path, SegmenterTable)
+        self._every = config.every_n_frames
+        self._model = _Model(path.parent / table.model, table, str(path))
+        used = {k: label_set.names.index(n) for k, n in table.names.items() if n in label_set.names}
+        if not used and not table.moving:
+            raise ConfigError(
+                f"{path}: names: none of the classes of '{label_set.name}' is among them: "
+                f"{', '.join(label_set.names)}; name at least one, or classes in `moving`"
+            )
+        ours = sorted(set(used.values()))
+        self._group = tuple(ours.index(i) if i in ours else len(ours) for i in range(len(label_set)))
+        answers = [ours.index(used[name]) if name in used else len(ours) for name in table.classes]
+        moving = np.array([name in table.moving for name in table.classes], np.float32)
+        likelihoods = _likelihoods(answers, len(ours), table.miss, table.false_alarm)
+        self._columns = np.column_stack((likelihoods, moving))
+        self.moves = bool(moving.any())
+        self._count = 0
+        self._last: _Answer | None = None
+
+    def look(self, views: FrameViews, coarse: CameraIntrinsics) -> Opinion:
+        """What the model says of a frame at ``coarse`` pixels (h, w), or said of one before."""
+        if self._count % self._every == 0:
+            values = self._ask(views.frame.rgb, (coarse.height, coarse.width))
+            self._last = _Answer(values, views.depth(coarse), coarse, views.frame.T_world_camera)
+        else:
+            assert self._last is not None
+            values = _carried(self._last, views.depth(coarse), coarse, views.frame.T_world_camera)
+        self._count += 1
+        return Opinion(values[..., :-1], self._group, values[..., -1] >= MOVES)
+
+    def _ask(self, rgb: UInt8, size: tuple[int, int]) -> Float32:
+        """(h, w, G + 1) of an image (H, W, 3), at ``size``."""
+        height, width = self._model.input_size(rgb.shape[0], rgb.shape[1], self.table.width)
+        shrinks = width < rgb.shape[1]
+        picture = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        if self.table.channels == "bgr":
+            picture = picture[..., ::-1]
+        values = (picture.astype(np.float32) - np.array(self.table.mean, np.float32)) * np.array(
+            self.table.scale, np.float32
+        )
+        likelihood = _probabilities(_spread(self._model.run(values), size), self.table) @ self._columns
+        likelihood[..., :-1] **= np.float32(self.table.weight)
+        return likelihood
+
+
+class _Model:
+    """A network for images of any size, or of its own. ConfigError: a file that is missing or no such network."""
+
+    def __init__(self, path: Path, table: SegmenterTable, where: str) -> None:
+        try:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            hint = nearest_path(path) if isinstance(error, FileNotFoundError) else ""
+            raise ConfigError(f"{where}: model: {path} cannot be read ({error.strerror}){hint}") from error
+        if table.sha256 and digest != table.sha256.lower():
+            raise ConfigError(f"{where}: sha256 is not that of {path} ({digest}); fetch the model again")
+        try:
+            self._network = core().read_model(path)
+            (taken,), (given,) = self._network.inputs, self._network.outputs
+            self._channels_last = taken.partial_shape[3] == 3
+            self._is_static = not taken.partial_shape.is_dynamic
+            if not self._is_static:
+                self._reshape(*self.input_size(table.width, table.width, table.width))
+            shape, taken_shape = list(given.get_shape()), list(taken.get_shape())
+        except (RuntimeError, ValueError, IndexError) as error:
+            reason = str(error).strip().splitlines()[-1][:300]
+            raise ConfigError(
+                f"{where}: model: {path} is no network of one picture (1, 3, H, W) or (1, H, W, 3) and one output that "
+                f"OpenVINO reads ({reason})"
+            ) from error
+        count = len(table.classes)
+        self._classes_last = len(shape) == 4 and shape[3] == count
+        is_picture = taken_shape[0] == 1 and taken_shape[3 if self._channels_last else 1] == 3
+        if not is_picture or len(shape) != 4 or shape[0] != 1 or count not in (shape[1], shape[3]):
+            raise ConfigError(
+                f"{where}: {path} makes {shape} of {taken_shape}; it has to make {count} values a pixel, as many as "
+                "`classes`, of one picture of three channels"
+            )
+        self._requests: dict[tuple[int, int], Any] = {}
+
+    def input_size(self, height: int, width: int, longer: int) -> tuple[int, int]:
+        """Height and width of the picture that is put in, for an image of a size."""
+        if self._is_static:
+            shape = list(self._network.inputs[0].get_shape())
+            return (shape[1], shape[2]) if self._channels_last else (shape[2], shape[3])
+        sides = (longer - STEP * round(longer * (1 - n / max(height, width)) / STEP) for n in (height, width))
+        height, width = (max(STEP, n) for n in sides)
+        return height, width
+
+    def run(self, picture: Float32) -> Float32:
+        """Outputs (h, w, K) of a prepared picture (H, W, 3)."""
+        size = picture.shape[0], picture.shape[1]
+        if size not in self._requests:
+            if not self._is_static:
+                self._reshape(*size)
+            self._requests[size] = compile_request(self._network)
+        request = self._requests[size]
+        put_in = picture if self._channels_last else picture.transpose(2, 0, 1)
+        request.infer([np.ascontiguousarray(put_in)[None]], share_inputs=True)
+        out = np.asarray(request.get_output_tensor(0).data, np.float32)[0]
+        return out if self._classes_last else out.transpose(1, 2, 0)
+
+    def _reshape(self, height: int, width: int) -> None:
+        self._network.reshape([1, height, width, 3] if self._channels_last else [1, 3, height, width])
+
+
+def _likelihoods(answers: list[int], count: int, miss: float, false_alarm: float) -> Float32:
+    """(K, G + 1): P(answer | group) of each class of the model, which is of a group, or of none: ``count``."""
+    table = np.full((len(answers), count + 1), false_alarm, np.float32)
+    for row, answer in zip(table, answers, strict=True):
+        if answer == count:
+            row[:count], row[count] = miss, 1 - false_alarm
+        else:
+            row[answer] = 1 - miss
+    return table
+
+
+def _spread(values: Float32, size: tuple[int, int]) -> Float32:
+    """(h, w, K) at another size. Corners stay corners, as in networks that stride over sides of 8 n + 1 pixels."""
+    (h, w), (height, width) = values.shape[:2], size
+    x = np.tile(np.linspace(0, w - 1, width, dtype=np.float32), (height, 1))
+    y = np.tile(np.linspace(0, h - 1, height, dtype=np.float32)[:, None], (1, width))
+    parts = [cv2.remap(np.ascontiguousarray(values[..., i]), x, y, cv2.INTER_LINEAR) for i in range(values.shape[2])]
+    return np.stack(parts, axis=2).astype(np.float32, copy=False)
+
+
+def _probabilities(values: Float32, table: SegmenterTable) -> Float32:
+    """(h, w, K) of what the model gives."""
+    if table.output == "probabilities":
+        return values
+    values = values / np.float32(table.temperature)
+    values = np.exp(values - values.max(axis=2, keepdims=True))
+    return values / values.sum(axis=2, keepdims=True)
+
+
+def _carried(last: _Answer, depth_m: Float32, intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Float32:
+    """The answer (h, w, G + 1) about surface that another frame sees at depth (h, w)."""
+    values = np.ones((*depth_m.shape, last.likelihood.shape[2]), np.float32)
+    values[..., -1] = 0
+    rows, columns = np.nonzero(depth_m)
+    points = unproject(depth_m, intrinsics)[rows, columns]
+    seen = transform(invert_pose(last.T_world_camera) @ T_world_camera, points)
+    inside, v, u = nearest_pixels(seen, last.intrinsics)
+    same = inside & (np.abs(last.depth_m[v, u] - seen[:, 2]) <= MARGIN_M + MARGIN_PER_M * seen[:, 2])
+    values[rows[same], columns[same]] = last.likelihood[v[same], u[same]]
+    return values
