@@ -318,9 +318,9 @@ class MovingConfig(Config, frozen=True):
 
 
 class SegmenterConfig(Config, frozen=True):
-    """A network that has seen photographs, beside the field (``mapping/segmenter.py``)."""
+    """A network that has seen photographs, next to the field (``mapping/segmenter.py``)."""
 
-    # Its table (.toml), beside an ONNX or OpenVINO model; "" = none. Its classes join the labels and votes of frames,
+    # Its table (.toml), next to an ONNX or OpenVINO model; "" = none. Its classes join the labels and votes of frames,
     # its people and vehicles are among what ``moving.classes`` leaves out
     table: str = ""
     # Frames from one that it is shown to the next; those between take its answer over by depth

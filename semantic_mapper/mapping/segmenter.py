@@ -1,14 +1,15 @@
 """A second opinion of what a frame shows: a network for single images that has learned from photographs.
 
-Any model in ONNX, or OpenVINO's IR, beside a table that says how pictures are put in and what its classes are here. It
-is no vote of its own: for a class c of the map, P(answer | c) is 1 - ``miss`` where the answer is c, ``false_alarm``
-where it is another class of the map, the rest where it is none of these; for a class that the model lacks likewise.
-The rendered probability of c times the expected likelihood of the model's answer, to the power ``weight``, is the joint
-one (Bayes' rule, with errors of the two taken for independent). A model that misses most tables thereby says little
-where it sees none, and much where it sees one.
+Any model in ONNX, or OpenVINO's IR, and next to it a table that says how pictures are put in and what its classes are
+here. It has no vote of its own. For a class c of the map that the model has, P(answer | c) is 1 - ``miss`` where the
+answer is c, ``false_alarm`` where it is another class of the map, and ``miss`` where the map lacks it. For
+classes that the model lacks it is ``false_alarm`` where the answer is a class of the map, else 1 - ``false_alarm``. The
+rendered probability of c times the expected likelihood of the answer, to the power ``weight``, is the joint one (Bayes'
+rule, with errors of the two taken for independent). A model that misses most tables thereby says little where it sees
+none, and much where it sees one.
 
 Every n-th frame is shown to the model. Frames between take the answer over where their depth, and the pose, lead to the
-surface that the answer was about; elsewhere there is none.
+surface that the answer was about; elsewhere nothing is known.
 """
 
 # OpenVINO leaves parts of its interface untyped.
@@ -41,9 +42,9 @@ Triple = tuple[float, float, float]
 
 
 class SegmenterTable(Config, frozen=True):
-    """What the table beside a model says."""
+    """What the table next to a model says."""
 
-    model: str  # file, beside the table
+    model: str  # file, next to the table
     width: Annotated[int, msgspec.Meta(ge=STEP, le=4096)]  # of the longer side of pictures, for a model of any size
     # in the order of the outputs
     classes: Annotated[tuple[str, ...], msgspec.Meta(min_length=2, max_length=MOST_CLASSES)]
