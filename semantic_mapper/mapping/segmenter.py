@@ -134,15 +134,21 @@ class Segmenter:
 
     def _ask(self, rgb: UInt8, size: tuple[int, int]) -> Float32:
         """(h, w, G + 1) of an image (H, W, 3), at ``size``."""
+        return self._likelihood(self._model.run(self._prepared(rgb)), size)
+
+    def _prepared(self, rgb: UInt8) -> Float32:
+        """What is put in, (H, W, 3), of an image."""
         height, width = self._model.input_size(rgb.shape[0], rgb.shape[1], self.table.width)
         shrinks = width < rgb.shape[1]
         picture = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         if self.table.channels == "bgr":
             picture = picture[..., ::-1]
-        values = (picture.astype(np.float32) - np.array(self.table.mean, np.float32)) * np.array(
-            self.table.scale, np.float32
-        )
-        likelihood = _probabilities(_spread(self._model.run(values), size), self.table) @ self._columns
+        mean, scale = (np.array(of, np.float32) for of in (self.table.mean, self.table.scale))
+        return (picture.astype(np.float32) - mean) * scale
+
+    def _likelihood(self, outputs: Float32, size: tuple[int, int]) -> Float32:
+        """(h, w, G + 1) of outputs (a, b, K)."""
+        likelihood = _probabilities(_spread(outputs, size), self.table) @ self._columns
         likelihood[..., :-1] **= np.float32(self.table.weight)
         return likelihood
 
