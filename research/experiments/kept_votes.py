@@ -23,6 +23,7 @@ from research.suites.rooms import as_given
 from semantic_mapper.config import MapperConfig, SegmenterConfig, VoxelMapConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import Encoded
+from semantic_mapper.fields.weights import default_checkpoint_path, load_weights
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import FrameViews
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
@@ -122,7 +123,8 @@ def keep(path: Path, frames: Iterable[PosedFrame], labels: LabelSet, table: str,
     """Map frames with labels, and write what was said of them; ``more`` is the true surface, where it is known."""
     mapper = Mapper.load(None, CONFIG)
     asking = _Asking(SegmenterConfig(table=table), mapper.label_set) if table else None
-    pipeline = _Keeping(CONFIG, make_field(mapper.weights, CONFIG), mapper.label_set)
+    config = mapper.pipeline.config
+    pipeline = _Keeping(config, make_field(mapper.weights, config), mapper.label_set)
     kept: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
     for frame in frames:
         try:
@@ -158,7 +160,7 @@ def load(path: Path) -> Recording:
         values = {name: file[name] for name in file.files}
     names, ids = [str(n) for n in values["stream_names"]], [int(i) for i in values["stream_ids"]]
     stream = make_label_set(path.stem, names, ids=ids, ignore_id=int(values["stream_ignore"]))
-    target = ROOMS
+    target = load_weights(default_checkpoint_path()).label_set
     to_map = TruthMapper(stream, target)
     surface, frames = SurfaceTruth(stream), list[Kept]()
     for i, (rgb, depth, label, pose, k) in enumerate(zip(*(values[n] for n in _ARRAYS[:5]), strict=True)):
@@ -171,9 +173,9 @@ def load(path: Path) -> Recording:
 
     def truth(xyz: Float32) -> tuple[UInt8, Bool]:
         if "xyz" in values:
-            labels = nearest_labels(xyz, values["xyz"], values["surface"], target, max_distance_m=NEAR_M)
-            return labels, labels != target.ignore_id
-        labels = surface.labels_at(xyz)
+            labels = nearest_labels(xyz, values["xyz"], values["surface"], stream, max_distance_m=NEAR_M)
+        else:
+            labels = surface.labels_at(xyz)
         return to_map.to_map_ids(labels, path.stem), labels != stream.ignore_id
 
     return Recording(path.stem, target, frames, truth)

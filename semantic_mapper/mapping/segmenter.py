@@ -102,7 +102,7 @@ class Segmenter:
 
     def __init__(self, config: SegmenterConfig, label_set: LabelSet) -> None:
         path = Path(config.table)
-        self.table = table = load_config(path, SegmenterTable)
+        table = load_config(path, SegmenterTable)
         self._every = config.every_n_frames
         self._model = _Model(path.parent / table.model, table, str(path))
         used = {k: label_set.names.index(n) for k, n in table.names.items() if n in label_set.names}
@@ -114,12 +114,16 @@ class Segmenter:
         ours = sorted(set(used.values()))
         self._group = tuple(ours.index(i) if i in ours else len(ours) for i in range(len(label_set)))
         answers = [ours.index(used[name]) if name in used else len(ours) for name in table.classes]
-        moving = np.array([name in table.moving for name in table.classes], np.float32)
-        likelihoods = _likelihoods(answers, len(ours), table.miss, table.false_alarm)
-        self._columns = np.column_stack((likelihoods, moving))
-        self.moves = bool(moving.any())
+        self._answers, self._groups = answers, len(ours)
+        self._moving = np.array([name in table.moving for name in table.classes], np.float32)
+        self._use(table)
+        self.moves = bool(self._moving.any())
         self._count = 0
         self._last: _Answer | None = None
+
+    def _use(self, table: SegmenterTable) -> None:
+        likelihoods = _likelihoods(self._answers, self._groups, table.miss, table.false_alarm)
+        self.table, self._columns = table, np.column_stack((likelihoods, self._moving))
 
     def look(self, views: FrameViews, coarse: CameraIntrinsics) -> Opinion:
         """What the model says of a frame at ``coarse`` pixels (h, w), or said of one before."""
