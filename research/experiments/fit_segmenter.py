@@ -26,9 +26,9 @@ from semantic_mapper.mapping.rendering import RenderedView
 from semantic_mapper.mapping.segmenter import Opinion, Segmenter
 
 GRID = {
-    "miss": (0.3, 0.5, 0.6, 0.7, 0.85, 0.95),
+    "miss": (0.3, 0.5, 0.7, 0.85),
     "false_alarm": (0.01, 0.02, 0.05, 0.1, 0.2),
-    "weight": (0.25, 0.5, 1.0),
+    "weight": (0.5, 1.0),
     "temperature": (1.0, 2.0),
 }
 OFF = {"weight": 0.0}
@@ -79,7 +79,7 @@ def frames_of(folder: Path, name: str, every: int) -> tuple[LabelSet, list[Kept]
     name, _, part = name.partition(":")
     first, step = map(int, part.split("/")) if part else (0, 1)
     recordings = list(load_all(folder, name))
-    found = [kept for r in recordings for kept in r.frames[:: every if len(r.frames) >= 100 else 1]]
+    found = [kept for r in recordings for kept in r.frames[:: every if len(r.frames) > 4 * every else 1]]
     return recordings[0].label_set, found[first::step]
 
 
