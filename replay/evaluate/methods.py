@@ -34,6 +34,7 @@ class Opinion(NamedTuple):
 
     label: UInt8  # (H, W) ids, the ignore id = unknown
     confidence: Float32 | None = None  # (H, W) their probabilities, None where the method has none
+    likeliest: UInt8 | None = None  # (H, W) ids that these are of where ``label`` may be unknown for want of confidence
 
 
 SURE = 0.9  # confidence of a pixel that a user would keep
@@ -78,7 +79,8 @@ class _Scores:
         self.confusion.update(truth, found.label, where)
         if found.confidence is not None:
             strange = truth == self.confusion.label_set.ignore_id
-            self.confidence.update(found.confidence[known], (found.label == truth)[known], strange[known])
+            right = (found.label if found.likeliest is None else found.likeliest) == truth
+            self.confidence.update(found.confidence[known], right[known], strange[known])
 
     def figures(self) -> dict[str, Any]:
         sure, right = self.confidence.above(SURE)
@@ -201,7 +203,8 @@ def evaluate_frames(
         if labelled.any():
             truth, voted = truth_mapper.to_map_ids(labels, MAP), labelled & (points.confidence > 0)
             of_map = _Scores(label_set)
-            of_map.add(truth, Opinion(points.label, points.confidence), voted, MAP)
+            likeliest = voxel_map.points(unknown_below=0).label
+            of_map.add(truth, Opinion(points.label, points.confidence, likeliest), voted, MAP)
             strange = points.label[(truth == label_set.ignore_id) & voted]
             rejected = float((strange == label_set.ignore_id).mean()) if len(strange) else None
             methods[MAP] = of_map.figures() | {"open_set_unknown": rejected}

@@ -213,16 +213,16 @@ class VoxelMap:
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
-    def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
+    def points(self, min_weight: float = SURFACE_WEIGHT, *, unknown_below: float | None = None) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order; 1 as ``min_weight`` = only what was
-        measured."""
+        measured. ``unknown_below`` instead of the setting."""
         _check_min_weight(min_weight)
         parts: list[MapPoints] = []
         with _KERNEL_LOCK:
             for keys, blocks, grid in self._grid.tiles():
                 voxels = surface_voxels(keys, blocks, grid, min_weight)
                 xyz = (voxels * self.config.voxel_size_m).astype(np.float32)
-                parts.append(MapPoints(xyz, *self._read(grid, voxels)))
+                parts.append(MapPoints(xyz, *self._read(grid, voxels, unknown_below)))
         return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
     def mesh(self, min_weight: float = SURFACE_WEIGHT) -> MapMesh:
@@ -389,9 +389,12 @@ class VoxelMap:
         decision = Decision(self.config.vote_discount, self.config.unknown_below, min_weight)
         return CopiedChanges(result, packed_parts(self._grid, packed[rows]), self.label_set, decision)
 
-    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[UInt8, UInt8, Float32, Bool]:
+    def _read(
+        self, grid: BlockGrid, voxels: Float64, unknown_below: float | None = None
+    ) -> tuple[UInt8, UInt8, Float32, Bool]:
         """Colour, label, confidence and whether it was measured, at points (N, 3) in voxels."""
-        read = read_points(voxels, grid.index, grid.buffers(), self.config.vote_discount, self.config.unknown_below)
+        below = self.config.unknown_below if unknown_below is None else unknown_below
+        read = read_points(voxels, grid.index, grid.buffers(), self.config.vote_discount, below)
         return read.rgb, self.label_set.to_ids(read.channel), read.confidence, read.measured
 
 

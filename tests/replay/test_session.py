@@ -3,6 +3,7 @@ import pickle
 from dataclasses import replace
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -305,6 +306,10 @@ def test_the_map_is_scored_at_its_points_beside_the_frames():
     assert figures["open_set_auroc"] > 0.95 and 0.05 < figures["ece"] < 0.25
     assert 0.9 < figures["open_set_unknown"] < 1.0, "all but what mixes with walls at the border"
     assert 0 < figures["pixels"] < len(voxel_map.points().xyz)
+    voxel_map.config = msgspec.structs.replace(voxel_map.config, unknown_below=1.0)
+    unsure = evaluate_frames(frames, {"": lambda f: Opinion(f.label)}, stream, ROOMS, held_back, voxel_map=voxel_map)
+    assert unsure.methods[MAP]["ece"] == figures["ece"], "confidence is that of the likeliest class, unknown or not"
+    assert unsure.methods[MAP]["open_set_unknown"] == 1.0 and unsure.methods[MAP]["total_accuracy"] == 0
     assert MAP not in evaluate_frames(frames, {"fused": fuse}, stream, ROOMS, frozenset()).methods
 
 
