@@ -190,7 +190,7 @@ class KeyframeConfig(Config, frozen=True):
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
     # Weight of what its image says by itself, against the rendered view, in what it tells the map; its own labels are
     # those of the rendered view.
-    own_image_weight: Fraction = 0.2
+    own_image_weight: Fraction = 0.8
     # Whether the map keeps features of views that its sensor measured (45 kB each, 300 at most), by which it is found
     # again: `query MAP relocalize LOG`, `up --set map=...`, `merge`. Images can be guessed from such features; False
     # keeps none.
