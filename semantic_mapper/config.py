@@ -320,10 +320,10 @@ class MovingConfig(Config, frozen=True):
 class SegmenterConfig(Config, frozen=True):
     """A network that has seen photographs, next to the field (``mapping/segmenter.py``)."""
 
-    # Its table (.toml), next to an ONNX or OpenVINO model; "" = none. Its classes join the labels and votes of frames,
-    # its people and vehicles are among what ``moving.classes`` leaves out
+    # Its table (.toml), next to an ONNX or OpenVINO model; "" = none. ``moving.classes`` leaves its people and vehicles
+    # out
     table: str = ""
-    # Frames from one that it is shown to the next; those between take its answer over by depth
+    # Of so many frames it sees one; the others take its answer over by depth
     every_n_frames: AtLeastOne = 8
 
 
