@@ -1,0 +1,224 @@
+"""Objects with a memory: things of a map that keep their id over visits, when they are moved, and in saved maps."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import CodecError, MapError
+from semantic_mapper.queries.instances import OrientedBox
+from semantic_mapper.transport.images import zstd_compress, zstd_decompress
+from semantic_mapper.types import Float64, UInt8
+
+MAX_OBJECTS = 10_000
+MAX_PLACES = 8  # that an object keeps of its history
+MAX_CLASSES = 4  # that an object keeps the probabilities of
+POINTS = 64  # of its surface that an object keeps, at most
+SIGNATURE = 96  # numbers of a signature
+MAX_BYTES = 50 << 20  # of a memory in a file, unpacked
+
+Kind = Literal["moved", "new", "gone"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectPlace:
+    """Where an object was from a time on."""
+
+    stamp_ns: int  # first seen here
+    box: OrientedBox
+    room: int | None  # id of the room, as of ``SceneGraph``; None = not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapObject:
+    """A thing that is remembered."""
+
+    id: int  # above 0; never given to another, and stays with the thing when it is moved, and in saved maps
+    class_id: int  # the likeliest
+    class_name: str
+    # (class id, probability), the likeliest first; at most ``MAX_CLASSES``; they sum to 1 or less
+    classes: tuple[tuple[int, float], ...]
+    box: OrientedBox  # of where it is, or was last
+    color: UInt8  # (3,) uint8 mean RGB of its surface
+    signature: NDArray[np.int8] = field(repr=False)  # (SIGNATURE,) int8, what it looks like; see ``signature_of``
+    points: NDArray[np.int16] = field(repr=False)  # (N, 3) int16 of its surface, millimetres from the box's centre
+    first_seen_ns: int
+    last_seen_ns: int
+    views: int  # updates of the memory in which it was seen
+    room: int | None  # where it is, or was last
+    places: tuple[ObjectPlace, ...]  # where it was, the oldest first; the last is the present one
+    missed: int = 0  # updates since in which its place was seen without it
+    gone_ns: int | None = None  # when its place was first seen without it; None = it is there
+
+    @property
+    def surface(self) -> Float64:
+        """(N, 3) float64 points of its surface, world metres."""
+        return self.box.center + self.points / 1000.0
+
+    @property
+    def probability(self) -> float:
+        """Of the likeliest class."""
+        return self.classes[0][1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectChange:
+    """What became of one object between two visits."""
+
+    kind: Kind
+    object: MapObject  # as it is now; of what has gone, as it was
+    before: ObjectPlace | None  # where it was before; None of what is new
+    probability: float  # that the change is real
+
+
+class _Box(msgspec.Struct, frozen=True, array_like=True):
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    R: tuple[float, float, float, float, float, float, float, float, float]
+
+
+class _Place(msgspec.Struct, frozen=True, array_like=True):
+    stamp_ns: int
+    box: _Box
+    room: int | None
+
+
+class _Row(msgspec.Struct, frozen=True, array_like=True):
+    id: Annotated[int, msgspec.Meta(ge=1)]
+    class_name: str
+    classes: tuple[tuple[int, float], ...]
+    color: Annotated[bytes, msgspec.Meta(min_length=3, max_length=3)]
+    signature: Annotated[bytes, msgspec.Meta(min_length=SIGNATURE, max_length=SIGNATURE)]
+    points: Annotated[bytes, msgspec.Meta(max_length=6 * POINTS)]
+    first_seen_ns: int
+    last_seen_ns: int
+    views: int
+    places: Annotated[tuple[_Place, ...], msgspec.Meta(min_length=1, max_length=MAX_PLACES)]
+    missed: int
+    gone_ns: int | None
+
+
+class _Rows(msgspec.Struct, frozen=True, array_like=True):
+    next_id: Annotated[int, msgspec.Meta(ge=1)]
+    objects: Annotated[tuple[_Row, ...], msgspec.Meta(max_length=MAX_OBJECTS)]
+
+
+class ObjectMemory:
+    """The objects of one map, by id; those that have gone, too.
+
+    Beyond ``MAX_OBJECTS`` those that went first are forgotten, then those seen least. Raises MapError: an id that comes
+    twice."""
+
+    def __init__(self, objects: Iterable[MapObject] = (), next_id: int = 1) -> None:
+        self._objects: dict[int, MapObject] = {}
+        for thing in objects:
+            if thing.id in self._objects:
+                raise MapError(f"object memory: id {thing.id} comes twice")
+            self._objects[thing.id] = thing
+        self._next_id = max((next_id, *(number + 1 for number in self._objects)))
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+    @property
+    def objects(self) -> tuple[MapObject, ...]:
+        """All, by ascending id."""
+        return tuple(self._objects[number] for number in sorted(self._objects))
+
+    @property
+    def there(self) -> tuple[MapObject, ...]:
+        """Those that have not gone, by ascending id."""
+        return tuple(thing for thing in self.objects if thing.gone_ns is None)
+
+    def get(self, number: int) -> MapObject | None:
+        """The object of an id; None where there is none, or it was forgotten."""
+        return self._objects.get(number)
+
+    def to_bytes(self) -> bytes:
+        """For a file; see ``from_bytes``."""
+        rows = _Rows(self._next_id, tuple(map(_row_of, self.objects)))
+        content = msgspec.msgpack.encode(rows)
+        return struct.pack("<I", len(content)) + zstd_compress(content)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> ObjectMemory:
+        """What ``to_bytes`` made, empty of no bytes. Raises MapError: it is damaged."""
+        if not data:
+            return cls()
+        try:
+            (size,) = struct.unpack_from("<I", data)
+            if size > MAX_BYTES:
+                raise MapError(f"object memory: {size} bytes, at most {MAX_BYTES} are read")
+            content = zstd_decompress(data[4:], size, "object memory")
+            rows = msgspec.msgpack.decode(content, type=_Rows)
+        except (CodecError, struct.error, msgspec.DecodeError, ValueError) as error:
+            raise MapError(f"object memory is damaged: {error}") from error
+        return cls(map(_object_of, rows.objects), rows.next_id)
+
+    def _forget(self) -> None:
+        excess = len(self._objects) - MAX_OBJECTS
+        if excess > 0:
+            latest = 2**63
+            ordered = sorted(
+                self._objects.values(), key=lambda o: (latest if o.gone_ns is None else o.gone_ns, o.views, -o.id)
+            )
+            for thing in ordered[:excess]:
+                del self._objects[thing.id]
+
+
+def _row_of(thing: MapObject) -> _Row:
+    return _Row(
+        thing.id,
+        thing.class_name,
+        thing.classes,
+        thing.color.tobytes(),
+        thing.signature.tobytes(),
+        thing.points.astype("<i2").tobytes(),
+        thing.first_seen_ns,
+        thing.last_seen_ns,
+        thing.views,
+        tuple(_Place(place.stamp_ns, _box_row(place.box), place.room) for place in thing.places),
+        thing.missed,
+        thing.gone_ns,
+    )
+
+
+def _object_of(row: _Row) -> MapObject:
+    if len(row.points) % 6 or not row.classes:
+        raise MapError(f"object memory is damaged: object {row.id} has {len(row.points)} bytes of points, or no class")
+    places = tuple(ObjectPlace(place.stamp_ns, _box_of(place.box), place.room) for place in row.places)
+    return MapObject(
+        id=row.id,
+        class_id=row.classes[0][0],
+        class_name=row.class_name,
+        classes=row.classes,
+        box=places[-1].box,
+        color=np.frombuffer(row.color, np.uint8),
+        signature=np.frombuffer(row.signature, np.int8),
+        points=np.frombuffer(row.points, "<i2").reshape(-1, 3).astype(np.int16),
+        first_seen_ns=row.first_seen_ns,
+        last_seen_ns=row.last_seen_ns,
+        views=row.views,
+        room=places[-1].room,
+        places=places,
+        missed=row.missed,
+        gone_ns=row.gone_ns,
+    )
+
+
+def _box_row(box: OrientedBox) -> _Box:
+    center, size, R = (
+        tuple(np.asarray(v, np.float64).ravel().tolist()) for v in (box.center, box.size, box.R_world_box)
+    )
+    values: Any = center, size, R
+    return _Box(*values)
+
+
+def _box_of(row: _Box) -> OrientedBox:
+    return OrientedBox(np.array(row.center), np.array(row.size), np.array(row.R).reshape(3, 3))
