@@ -35,6 +35,7 @@ from semantic_mapper.types import Int32, Int64
 
 FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 4
+MAX_OBJECT_BYTES = 64 << 20
 CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
 ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper map`"
 
@@ -67,6 +68,7 @@ _PLACES = {  # of ``Place``; only where there are any
     "points": "<f4",  # (N, 3)
     "descriptors": "|u1",  # (N, 128)
 }
+_OBJECTS = {"data": "|u1"}  # (N,) bytes of ``queries.objects.ObjectMemory``; only where there are any
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
@@ -88,6 +90,13 @@ class PlaceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sha256: Digest
 
 
+class ObjectTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The objects that the map remembers, in bytes of ``queries.objects.ObjectMemory``."""
+
+    bytes: Annotated[int, msgspec.Meta(ge=1, le=MAX_OBJECT_BYTES)]
+    sha256: Digest
+
+
 class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is known of a saved map without reading its blocks."""
 
@@ -105,6 +114,7 @@ class MapManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     # digest of the weights that refined the map; empty where none did
     refined: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
     places: PlaceTable | None = None  # what it is found again by
+    objects: ObjectTable | None = None  # what it remembers of its things
 
     @property
     def scale_known(self) -> bool:
@@ -138,7 +148,7 @@ def parse_manifest(content: bytes, where: str) -> MapManifest:
 
 
 def write_map(
-    path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = ()
+    path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = (), objects: bytes = b""
 ) -> MapManifest:
     """Write a map in one step; returns the manifest with what depends on the blocks filled in. ``parts`` are blocks in
     lexicographic order, ``CHUNK_BLOCKS`` at a time. ``MapError``: it cannot be written; a file from before is
@@ -159,6 +169,7 @@ def write_map(
                 bounds_m=_bounds_m(corners, manifest.config.voxel_size_m),
                 chunks=tuple(chunks),
                 places=_write_places(archive, places) if places else None,
+                objects=_write_objects(archive, objects) if objects else None,
             )
             content = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
             with archive.open(_MANIFEST, "w") as member:
@@ -262,6 +273,14 @@ class MapReader:
             places.append(Place(name, stamp_ns, pose, arrays["points"][rows], arrays["descriptors"][rows]))
         return tuple(places)
 
+    def objects(self) -> bytes:
+        """What the map remembers of its things, nothing where it does not; ``MapError`` where it is damaged."""
+        table = self.manifest.objects
+        if table is None:
+            return b""
+        where = f"{self._path}: its objects"
+        return self._read_arrays("objects", _OBJECTS, ((table.bytes,),), table.sha256, where)["data"].tobytes()
+
     def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> BlockPart:
         mask, measured, voted = (chunk.blocks, BLOCK_VOXELS // 8), (chunk.measured,), (chunk.voted,)
         classes = len(self.manifest.label_set)
@@ -325,6 +344,11 @@ def _write_places(archive: zipfile.ZipFile, places: Sequence[Place]) -> PlaceTab
     return PlaceTable(places=len(places), features=len(arrays["points"]), cameras=cameras, sha256=found)
 
 
+def _write_objects(archive: zipfile.ZipFile, objects: bytes) -> ObjectTable:
+    found = _write_arrays(archive, "objects", {"data": np.frombuffer(objects, np.uint8)}, _OBJECTS)
+    return ObjectTable(bytes=len(objects), sha256=found)
+
+
 def _write_arrays(
     archive: zipfile.ZipFile, folder: str, arrays: dict[str, NDArray[Any]], dtypes: dict[str, str]
 ) -> str:
@@ -368,6 +392,7 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         end = file.read()
     expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
     expected += [] if manifest.places is None else [f"places/{name}.npy" for name in _PLACES]
+    expected += [] if manifest.objects is None else [f"objects/{name}.npy" for name in _OBJECTS]
     whole = end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:] == archive.comment == _comment(content)
     if not whole or names != [*expected, _MANIFEST]:
         raise MapError(f"{path}: damaged: it is cut off or changed, or arrays are missing. {ADVICE}")

@@ -29,9 +29,14 @@ class FrozenMap:
     that changes it goes on, and the next reading fails. The caller holds the ``lock`` of the map meanwhile."""
 
     def __init__(
-        self, grid: BlockGrid, lock: AbstractContextManager[object], manifest: MapManifest, places: tuple[Place, ...]
+        self,
+        grid: BlockGrid,
+        lock: AbstractContextManager[object],
+        manifest: MapManifest,
+        places: tuple[Place, ...],
+        objects: bytes,
     ) -> None:
-        self.manifest, self.places = manifest, places
+        self.manifest, self.places, self.objects = manifest, places, objects
         self._grid, self._lock = grid, lock
         self._keys = grid.all_packed()
         self._settled = np.zeros(len(self._keys), np.bool_)  # copied, or not needed any more
@@ -45,7 +50,7 @@ class FrozenMap:
         without the lock; an error of its own ends the writing. ``MapError``: it cannot be written, or the disk fails; a
         file that was there is as it was."""
         try:
-            manifest = write_map(path, self.manifest, self.parts(between, last=True), self.places)
+            manifest = write_map(path, self.manifest, self.parts(between, last=True), self.places, self.objects)
         finally:
             self.close()
         size = path.stat().st_size

@@ -65,7 +65,8 @@ class VoxelMap:
 
     ``frames`` counts what is fused, ``version`` grows with every change, ``epoch`` counts how often another map has
     replaced the whole (``take_over``): blocks may be gone then. ``scale_known``: lengths are metres. ``refined`` is the
-    digest of the weights that refined the map, ``places`` are views to find it again by, ``cleared`` counts voxels of
+    digest of the weights that refined the map, ``places`` are views to find it again by, ``objects`` are the bytes of
+    what it remembers of its things (``queries.objects``; ``add`` leaves them as they are), ``cleared`` counts voxels of
     surfaces that frames of this process saw through."""
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
@@ -79,6 +80,7 @@ class VoxelMap:
         self.scale_known = True
         self.refined = ""
         self.places = PlaceStore()
+        self.objects = b""
         self.cleared = 0
         self._cleared_rows = NONE_CLEARED
         self._bounds = NO_BOUNDS  # of the last frame that cleared
@@ -209,7 +211,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined, self.places = other.refined, other.places
+            self.refined, self.places, self.objects = other.refined, other.places, other.objects
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -285,13 +287,13 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return FrozenMap(self._grid, _KERNEL_LOCK, manifest, self.places.places)
+            return FrozenMap(self._grid, _KERNEL_LOCK, manifest, self.places.places, self.objects)
 
     @classmethod
     def restored(cls, snapshot: FrozenMap) -> VoxelMap:
         """Another map, as one was when the snapshot was made, bit for bit."""
         made = cls(snapshot.manifest.config, snapshot.manifest.label_set)
-        made._begin_with(snapshot.manifest, snapshot.parts(), snapshot.places)
+        made._begin_with(snapshot.manifest, snapshot.parts(), snapshot.places, snapshot.objects)
         return made
 
     @classmethod
@@ -303,7 +305,7 @@ class VoxelMap:
         config = VoxelMapConfig(voxel_size_m=voxel_size_m, max_blocks=max(1, len(changes.keys)), unknown_below=below)
         made, scale = cls(config, label_set), scale_name(changes.scale_known)
         saved = MapManifest(config=config, label_set=label_set, frames=changes.version, last_stamp_ns=0, scale=scale)
-        made._begin_with(saved, received_parts(changes, label_set), ())
+        made._begin_with(saved, received_parts(changes, label_set), (), b"")
         return made
 
     @classmethod
@@ -327,10 +329,12 @@ class VoxelMap:
                 loaded._grid.reserve(saved.blocks)
             except (ConfigError, MapError) as error:
                 raise MapError(f"{path}: cannot be used: {error}; where memory is short, give memory_mb") from error
-            loaded._begin_with(saved, reader.parts(), reader.places())
+            loaded._begin_with(saved, reader.parts(), reader.places(), reader.objects())
         return loaded
 
-    def _begin_with(self, manifest: MapManifest, parts: Iterable[BlockPart], places: tuple[Place, ...]) -> None:
+    def _begin_with(
+        self, manifest: MapManifest, parts: Iterable[BlockPart], places: tuple[Place, ...], objects: bytes
+    ) -> None:
         for keys, values in parts:
             with _KERNEL_LOCK:
                 self._grid.mark_changed(self._grid.fill(pack_keys(keys), values), manifest.frames)
@@ -339,6 +343,7 @@ class VoxelMap:
         self.note_scale(manifest.scale_known)
         self.refined = manifest.refined
         self.places = PlaceStore(places)
+        self.objects = objects
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
         """A new map of what both have measured, in this map's frame and with its settings; see ``add``."""

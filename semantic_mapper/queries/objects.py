@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -12,16 +14,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError, MapError
+from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.queries.instances import OrientedBox
+from semantic_mapper.queries.revisit import (
+    GONE_FREE,
+    LEAST_KNOWN,
+    SHIFTED_FREE,
+    SIGNATURE,
+    Candidate,
+    Fit,
+    MapVisit,
+    find_evidence,
+    match_candidates,
+    overlapping,
+    read_thing,
+    sample_points,
+    signature_of,
+)
 from semantic_mapper.transport.images import zstd_compress, zstd_decompress
 from semantic_mapper.types import Float64, UInt8
 
 MAX_OBJECTS = 10_000
 MAX_PLACES = 8  # that an object keeps of its history
 MAX_CLASSES = 4  # that an object keeps the probabilities of
-POINTS = 64  # of its surface that an object keeps, at most
-SIGNATURE = 96  # numbers of a signature
+POINTS = 96  # of its surface that an object keeps, at most
 MAX_BYTES = 50 << 20  # of a memory in a file, unpacked
+MEMORY_VIEWS = 9  # that the probabilities of classes are averaged over, at most
 
 Kind = Literal["moved", "new", "gone"]
 
@@ -53,8 +71,10 @@ class MapObject:
     views: int  # updates of the memory in which it was seen
     room: int | None  # where it is, or was last
     places: tuple[ObjectPlace, ...]  # where it was, the oldest first; the last is the present one
-    missed: int = 0  # updates since in which its place was seen without it
+    missed: int = 0  # views of its place since in which it was not to be seen
     gone_ns: int | None = None  # when its place was first seen without it; None = it is there
+    appeared: bool = False  # whether its first place had been seen without it before
+    seen: float = 1.0  # fraction of its outside that was seen, at best; its signature is of then
 
     @property
     def surface(self) -> Float64:
@@ -102,6 +122,8 @@ class _Row(msgspec.Struct, frozen=True, array_like=True):
     places: Annotated[tuple[_Place, ...], msgspec.Meta(min_length=1, max_length=MAX_PLACES)]
     missed: int
     gone_ns: int | None
+    appeared: bool
+    seen: float
 
 
 class _Rows(msgspec.Struct, frozen=True, array_like=True):
@@ -140,6 +162,80 @@ class ObjectMemory:
         """The object of an id; None where there is none, or it was forgotten."""
         return self._objects.get(number)
 
+    def update(
+        self,
+        now: MapVisit,
+        up: Float64,
+        stamp_ns: int,
+        rooms: Mapping[int, int | None] = MappingProxyType({}),
+        before: MapVisit | None = None,
+    ) -> tuple[ObjectChange, ...]:
+        """Take over what is seen now; returns what has changed since the last update, the surest first.
+
+        Args:
+            now: The map as it is, its things, and the views since the last update.
+            up: (3,) unit vector, along which boxes stand.
+            stamp_ns: Of the last frame.
+            rooms: Id of the room of each thing, by id of the thing.
+            before: The map of the last visit and its views, in the same world; without it nothing is known to be new,
+                and surfaces are not fitted to each other.
+        """
+        old, fit = self.there, Fit(None if before is None else before.snapshot, now.snapshot)
+        points = [sample_points(thing, now.snapshot) for thing in now.things]
+        same = overlapping([o.surface for o in old], points, lambda i, j: old[i].class_id == now.things[j].class_id)
+        still = {j for _, j in same}
+        goers, comers = dict[int, Candidate](), dict[int, Candidate]()
+        missed: dict[int, int] = {}
+        for i, thing in enumerate(old):
+            T_now_then = partial(fit.at, thing.box.center)
+            evidence = find_evidence(now, thing.surface, lambda T=T_now_then, o=thing: transform(T(), o.surface))
+            missed[i] = evidence.looks
+            if evidence.known >= LEAST_KNOWN and evidence.fraction_free >= SHIFTED_FREE:
+                center = transform(T_now_then(), thing.surface).mean(axis=0)
+                goers[i] = Candidate(thing.class_id, thing.box.size, center, evidence.fraction_free, thing.signature)
+        for j, thing in enumerate(now.things):
+            free = 0.0 if j in still else 1.0
+            if before is not None:
+                T = partial(fit.at, points[j].mean(axis=0))
+                evidence = find_evidence(before, points[j], lambda T=T, j=j: transform(invert_pose(T()), points[j]))
+                free = evidence.fraction_free if evidence.known >= LEAST_KNOWN else 0.0
+            if free >= SHIFTED_FREE:
+                sign = signature_of(now.snapshot, thing, up)
+                comers[j] = Candidate(thing.class_id, thing.box.size, points[j].mean(axis=0), free, sign)
+        away = [o for o in self.objects if o.gone_ns is not None]
+        rows = [*goers.values(), *(Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature) for o in away)]
+        sources, targets = [*(old[i] for i in goers), *away], list(comers)
+        left, came, changes = set[int](), set[int](), list[ObjectChange]()
+        for r, c, probability in match_candidates(rows, list(comers.values())):
+            thing, j = sources[r], targets[c]
+            moved = _refreshed(thing, now, j, up, stamp_ns, rooms)
+            place = ObjectPlace(stamp_ns, moved.box, moved.room)
+            moved = replace(moved, places=(*thing.places, place)[-MAX_PLACES:], missed=0, gone_ns=None)
+            self._objects[thing.id] = moved
+            left.add(thing.id)
+            came.add(j)
+            changes.append(ObjectChange("moved", moved, thing.places[-1], probability))
+        for i, goer in goers.items():
+            thing = old[i]
+            if thing.id not in left and goer.free >= GONE_FREE:
+                self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=max(1, missed[i]))
+                left.add(thing.id)
+                changes.append(ObjectChange("gone", self._objects[thing.id], thing.places[-1], goer.free))
+        for i, j in same:
+            if old[i].id not in left and j not in came:
+                self._objects[old[i].id] = _refreshed(old[i], now, j, up, stamp_ns, rooms)
+                came.add(j)
+        for j in range(len(now.things)):
+            if j not in came:
+                appeared = before is not None and j in comers and comers[j].free >= GONE_FREE
+                made = replace(_remembered(self._next_id, now, j, up, stamp_ns, rooms), appeared=appeared)
+                self._objects[made.id] = made
+                self._next_id += 1
+                if appeared:
+                    changes.append(ObjectChange("new", made, None, comers[j].free))
+        self._forget()
+        return tuple(sorted(changes, key=lambda change: -change.probability))
+
     def to_bytes(self) -> bytes:
         """For a file; see ``from_bytes``."""
         rows = _Rows(self._next_id, tuple(map(_row_of, self.objects)))
@@ -172,6 +268,60 @@ class ObjectMemory:
                 del self._objects[thing.id]
 
 
+def _remembered(
+    number: int, now: MapVisit, j: int, up: Float64, stamp_ns: int, rooms: Mapping[int, int | None]
+) -> MapObject:
+    """A thing of now as a new object."""
+    thing, snapshot = now.things[j], now.snapshot
+    offsets = (sample_points(thing, snapshot, POINTS) - thing.box.center) * 1000
+    room = rooms.get(thing.id)
+    _, slot, voxel = read_thing(snapshot, thing)
+    return MapObject(
+        id=number,
+        class_id=thing.class_id,
+        class_name=thing.class_name,
+        classes=((thing.class_id, thing.confidence),),
+        box=thing.box,
+        color=snapshot.voxels.rgb[slot, voxel].mean(axis=0).astype(np.uint8),
+        signature=signature_of(snapshot, thing, up),
+        points=np.clip(np.round(offsets), -32767, 32767).astype(np.int16),
+        first_seen_ns=stamp_ns,
+        last_seen_ns=stamp_ns,
+        views=1,
+        room=room,
+        places=(ObjectPlace(stamp_ns, thing.box, room),),
+        seen=thing.seen,
+    )
+
+
+def _refreshed(
+    old: MapObject, now: MapVisit, j: int, up: Float64, stamp_ns: int, rooms: Mapping[int, int | None]
+) -> MapObject:
+    """An object that is seen as a thing of now; at the place of before, as far as its history goes."""
+    made, weight = _remembered(old.id, now, j, up, stamp_ns, rooms), min(old.views, MEMORY_VIEWS)
+    odds = {number: p * weight for number, p in old.classes}
+    odds[made.class_id] = odds.get(made.class_id, 0.0) + made.probability
+    classes = sorted(((n, p / (weight + 1)) for n, p in odds.items()), key=lambda c: -c[1])[:MAX_CLASSES]
+    likeliest = classes[0][0]
+    names = {old.class_id: old.class_name, made.class_id: made.class_name}
+    labels = now.snapshot.label_set
+    best = made if made.seen >= old.seen else old
+    place = ObjectPlace(old.places[-1].stamp_ns, made.box, made.room)
+    return replace(
+        made,
+        class_id=likeliest,
+        class_name=names.get(likeliest) or labels.names[labels.ids.index(likeliest)],
+        classes=tuple(classes),
+        signature=best.signature,
+        color=best.color,
+        first_seen_ns=old.first_seen_ns,
+        views=old.views + 1,
+        places=(*old.places[:-1], place),
+        appeared=old.appeared,
+        seen=best.seen,
+    )
+
+
 def _row_of(thing: MapObject) -> _Row:
     return _Row(
         thing.id,
@@ -186,6 +336,8 @@ def _row_of(thing: MapObject) -> _Row:
         tuple(_Place(place.stamp_ns, _box_row(place.box), place.room) for place in thing.places),
         thing.missed,
         thing.gone_ns,
+        thing.appeared,
+        thing.seen,
     )
 
 
@@ -209,6 +361,8 @@ def _object_of(row: _Row) -> MapObject:
         places=places,
         missed=row.missed,
         gone_ns=row.gone_ns,
+        appeared=row.appeared,
+        seen=row.seen,
     )
 
 

@@ -1,0 +1,333 @@
+"""Evidence for what has become of things between two states of a map, or between two maps in one world.
+
+A thing of before has gone where what is seen now lies behind its surface; a thing of now has come where what was seen
+before did. So what could not have been seen has neither gone nor come. Surfaces of before are first fitted to those of
+now round each thing, since poses of two visits differ by some centimetres. What has gone and what has come are then
+matched as a whole (linear assignment) by class, size, shape and colour; a pair that costs ``MOST_COST`` or more is one
+thing that has gone and another that is new."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads `optimize` when it is first used
+from numpy.typing import NDArray
+
+from semantic_mapper.geometry import transform
+from semantic_mapper.localization.places import Place
+from semantic_mapper.mapping.blocks import find_sorted, pack_keys
+from semantic_mapper.mapping.changes import TSDF_STEPS, UNOBSERVED
+from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.occupancy import State, read_states
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, surface_voxels
+from semantic_mapper.types import Bool, Float64, Int64
+
+NEAR_M = 0.08  # of the points of two things at one place
+OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of two classes; at least
+GONE_FREE = 0.6  # of what is known of its place: a thing of which so much is free is not there
+SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
+LEAST_KNOWN = 0.25  # of its surface
+MOST_COST = 1.0  # of a pair that is one thing
+COMPARED = 400  # surface voxels of a thing, at most
+LOOKS = 12  # views of a place that are asked whether they see through it
+LEAST_LOOKS = 1
+BEHIND_M = 0.1  # a view sees through a point where it meets the surface so far behind it
+REACH_M, PAST_M = 5.0, 1.5  # of a view, and how far past a point it is followed
+CELL_M, CELL_REACH_M = 2.0, 1.8  # surfaces are fitted in cells of this size, by what is so near to their middle
+FIT_POINTS, LEAST_FIT, FIT_ROUNDS = 3000, 300, 8
+FIT_TUKEY = 2.5  # voxels
+MOST_FIT_M, MOST_FIT_RAD = 0.08, 0.03
+LEAST_SHIFT_M = 0.06  # things that have been moved by less have not been moved
+CHROMA, LIGHT, SPREAD, RISE = 6, 12, 24, 16  # bins of a signature
+SIGNATURE = CHROMA**2 + LIGHT + SPREAD + RISE
+PARTS = np.cumsum((CHROMA**2, LIGHT, SPREAD))
+FACES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """Views that a map keeps (``localization.places``): P poses T_world_camera (P, 4, 4), the greatest slopes (P, 4)
+    of what they saw (left, up, right, down), and their stamps (P,)."""
+
+    poses: Float64
+    slopes: Float64
+    stamps_ns: Int64
+
+    @classmethod
+    def of(cls, places: Sequence[Place], after_ns: int = -(2**63)) -> Looks:
+        """Of places, those later than a stamp."""
+        used = [p for p in places if p.stamp_ns > after_ns and len(p.points)]
+        slopes = np.zeros((len(used), 4))
+        for row, place in zip(slopes, used, strict=True):
+            xy = place.points[:, :2] / place.points[:, 2:]
+            row[:2], row[2:] = xy.min(axis=0), xy.max(axis=0)
+        poses = np.array([p.T_world_camera for p in used]).reshape(-1, 4, 4)
+        return cls(poses, slopes, np.array([p.stamp_ns for p in used], np.int64))
+
+    def through(self, snapshot: MapSnapshot, points: Float64) -> tuple[Int64, int]:
+        """How many of the ``LOOKS`` views that have the most of points (N, 3), world metres, in view see through each
+        (N,), and how many of them see through most of those in view."""
+        free, through = np.zeros(len(points), np.int64), 0
+        if not len(self.poses) or not len(points):
+            return free, through
+        inside, _ = self._in_view(np.arange(len(self.poses)), points[:: 1 + len(points) // 8])
+        best = np.argsort(-inside.sum(axis=1), kind="stable")[:LOOKS]
+        inside, c = self._in_view(best, points)
+        for view in range(len(best)):
+            seen = np.flatnonzero(inside[view])
+            if not len(seen):
+                continue
+            ray = points[seen] - c[view]
+            length = np.linalg.norm(ray, axis=1)
+            hit = cast_rays(snapshot, c[view], ray, float(length.max()) + PAST_M).distance_m
+            sees = hit > length + BEHIND_M
+            free[seen] += sees
+            through += int(2 * sees.sum() > len(seen))
+        return free, through
+
+    def _in_view(self, views: Int64, points: Float64) -> tuple[Bool, Float64]:
+        """Which of points (N, 3) some views (V,) have in view (V, N), and where these are (V, 3)."""
+        R, c = self.poses[views, :3, :3], self.poses[views, :3, 3]
+        local = np.matmul(points[None] - c[:, None], R)
+        xy = local[..., :2] / np.maximum(local[..., 2:], 1e-6)
+        inside = (local[..., 2] > 0.2) & ((local**2).sum(axis=-1) < REACH_M**2)
+        inside &= (xy >= self.slopes[views, None, :2]).all(-1) & (xy <= self.slopes[views, None, 2:]).all(-1)
+        return inside, c
+
+
+class MapVisit(NamedTuple):
+    """A state of a map, its things, and the views that it comes of."""
+
+    snapshot: MapSnapshot
+    things: Sequence[Instance]
+    looks: Looks
+
+
+class Evidence(NamedTuple):
+    """Of N points: which are free in another map, and which have a surface there; the others are not known."""
+
+    free: Bool
+    solid: Bool
+    looks: int  # views that see through most of what they have of them in view
+
+    @property
+    def known(self) -> float:
+        """Fraction that is known."""
+        return float((self.free | self.solid).mean())
+
+    @property
+    def fraction_free(self) -> float:
+        """Of those known."""
+        return float(self.free.sum() / max(1, (self.free | self.solid).sum()))
+
+
+class Candidate(NamedTuple):
+    """A thing of one visit that may not be in the map of the other."""
+
+    class_id: int
+    size: Float64  # (3,) of its box
+    center: Float64  # (3,) mean of its surface, in the world of now
+    free: float  # of what is known of its place in the other map
+    signature: NDArray[np.int8]
+
+
+def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) -> list[tuple[int, int, float]]:
+    """Which of those that left are which of those that came, with the probability that they are: at most one each."""
+    cost = np.full((len(goers), len(comers)), np.inf)
+    for row, a in enumerate(goers):
+        for column, b in enumerate(comers):
+            shift = float(np.linalg.norm(b.center - a.center))
+            near = shift <= float(a.size.max()) and a.class_id == b.class_id
+            if shift >= LEAST_SHIFT_M and (near or min(a.free, b.free) >= GONE_FREE):
+                cost[row, column] = pair_cost(a, b)
+    return [(r, c, _likelihood(cost[r, c])) for r, c in _assign(cost)]
+
+
+def _likelihood(cost: float) -> float:
+    return float(1 / (1 + np.exp(6 * (cost - MOST_COST))))
+
+
+def _assign(cost: Float64) -> list[tuple[int, int]]:
+    """Pairs of rows and columns of the least total cost, where none costs ``MOST_COST``."""
+    rows, columns = cost.shape
+    if not rows or not columns:
+        return []
+    whole = np.full((rows + columns, rows + columns), 0.0)
+    whole[:rows, :columns] = np.minimum(cost, 1e3)
+    whole[:rows, columns:] = whole[rows:, :columns] = MOST_COST / 2
+    found = zip(*scipy.optimize.linear_sum_assignment(whole), strict=True)
+    return [(int(r), int(c)) for r, c in found if r < rows and c < columns and cost[r, c] < MOST_COST]
+
+
+def pair_cost(a: Candidate, b: Candidate) -> float:
+    """How different two things look: about 0.3 of one thing seen twice, 1 and more of two different ones."""
+    parts = (np.split(c.signature.astype(np.float64) / 127, PARTS) for c in (a, b))
+    chroma, light, spread, rise = (1 - float(x @ y) for x, y in zip(*parts, strict=True))
+    size_a, size_b = (np.maximum([*np.sort(c.size[:2]), c.size[2]], 0.04) for c in (a, b))
+    size = float(np.abs(np.log(size_a / size_b)).mean())
+    return 0.8 * chroma + 0.2 * light + 1.0 * spread + 0.8 * rise + 0.8 * size + 0.6 * (a.class_id != b.class_id)
+
+
+def signature_of(snapshot: MapSnapshot, thing: Instance, up: Float64) -> NDArray[np.int8]:
+    """(SIGNATURE,) int8: four histograms of unit length, times 127: of hue and saturation, of lightness against its
+    median, of distances between its points, and of their heights above its foot."""
+    points, slot, voxel = read_thing(snapshot, thing)
+    rgb = snapshot.voxels.rgb[slot, voxel].astype(np.float64) + 8.0
+    log = np.log(rgb)
+    plane = np.stack((log[:, 0] - log[:, 1], log[:, 2] - log[:, 1]), axis=1)
+    cell = np.clip(np.floor((plane / 1.2 + 0.5) * CHROMA), 0, CHROMA - 1).astype(np.int64)
+    lightness = log.mean(axis=1)
+    lightness -= np.median(lightness)
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(len(points), size=(2, 3000))
+    spread = np.log2(np.maximum(np.linalg.norm(points[a] - points[b], axis=1), 0.02) / 0.02) * 4
+    height = points @ up
+    rise = (height - np.percentile(height, 1)) / 0.06
+    histograms = (
+        np.bincount(cell[:, 0] * CHROMA + cell[:, 1], minlength=CHROMA**2),
+        _histogram((lightness + 1.2) / 0.2, LIGHT),
+        _histogram(spread, SPREAD),
+        _histogram(rise, RISE),
+    )
+    return np.concatenate([np.sqrt(h / max(1, h.sum())) * 127 for h in histograms]).round().astype(np.int8)
+
+
+def _histogram(values: Float64, bins: int) -> Int64:
+    return np.bincount(np.clip(np.floor(values), 0, bins - 1).astype(np.int64), minlength=bins)
+
+
+def read_thing(snapshot: MapSnapshot, thing: Instance) -> tuple[Float64, Int64, Int64]:
+    """Voxel centres (N, 3) of a thing, world metres, and slot and voxel of each; those still in the map."""
+    row, there = find_sorted(snapshot.packed, pack_keys(thing.voxels >> 3))
+    x, y, z = (thing.voxels[there] & 7).astype(np.int64).T
+    xyz = thing.voxels[there].astype(np.float64) * snapshot.voxel_size_m
+    return xyz, snapshot.slots[row[there]].astype(np.int64), (z * 8 + y) * 8 + x
+
+
+def sample_points(thing: Instance, snapshot: MapSnapshot, most: int = COMPARED) -> Float64:
+    """Centres of at most so many of its voxels, world metres."""
+    every = -(-len(thing.voxels) // most)
+    return thing.voxels[::every].astype(np.float64) * snapshot.voxel_size_m
+
+
+def find_evidence(visit: MapVisit, points: Float64, fitted: Callable[[], Float64]) -> Evidence:
+    """What is known in a map of points (N, 3), world metres; ``fitted`` gives them as they lie where the surfaces of
+    both maps are fitted, and is asked where they seem not to be there."""
+    voxel_m = visit.snapshot.voxel_size_m
+    free, solid = _states(visit.snapshot, points / voxel_m)
+    if 2 * solid.sum() > len(points) and free.sum() < SHIFTED_FREE * (free | solid).sum():
+        return Evidence(free, solid, 0)
+    points = fitted()
+    free, solid = _states(visit.snapshot, points / voxel_m)
+    through, looks = visit.looks.through(visit.snapshot, points)
+    free |= ~solid & (through >= LEAST_LOOKS)
+    return Evidence(free, solid, looks)
+
+
+def _states(snapshot: MapSnapshot, voxels: Float64) -> tuple[Bool, Bool]:
+    """Which of points (N, 3) in voxels are free, with no surface at one voxel from them, and which have one."""
+    states = read_states((voxels + FACES[:, None]).reshape(-1, 3), snapshot).reshape(len(FACES), -1)
+    solid = (states == State.OCCUPIED).any(axis=0)
+    return (states[0] == State.FREE) & ~solid, solid
+
+
+def overlapping(
+    before: Sequence[Float64], now: Sequence[Float64], same_class: Callable[[int, int], bool]
+) -> list[tuple[int, int]]:
+    """Pairs of things whose points (N, 3) lie at the same place, the best first, each at most once."""
+    pairs: list[tuple[float, int, int]] = []
+    if before and now:
+        ends = [np.array([(p.min(axis=0), p.max(axis=0)) for p in points]) for points in (before, now)]
+        meet = (ends[0][:, None, 0] < ends[1][None, :, 1] + 0.05) & (ends[1][None, :, 0] < ends[0][:, None, 1] + 0.05)
+        trees = [[scipy.spatial.KDTree(p) for p in points] for points in (before, now)]
+        for i, j in np.argwhere(meet.all(axis=2)).tolist():
+            one, other = (
+                np.isfinite(tree.query(p, distance_upper_bound=NEAR_M)[0]).mean()
+                for tree, p in ((trees[1][j], before[i]), (trees[0][i], now[j]))
+            )
+            score = float(one * other) * (1.0 if same_class(i, j) else OTHER_CLASS)
+            if score >= LEAST_SCORE:
+                pairs.append((score, i, j))
+    found, used = list[tuple[int, int]](), (set[int](), set[int]())
+    for _, i, j in sorted(pairs, reverse=True):
+        if i not in used[0] and j not in used[1]:
+            found.append((i, j))
+            used[0].add(i)
+            used[1].add(j)
+    return found
+
+
+class Fit:
+    """How surfaces of one map lie in another: a motion for each cell, found when it is first asked for; without a map
+    of before, as they are."""
+
+    def __init__(self, before: MapSnapshot | None, after: MapSnapshot) -> None:
+        self._after, self._motions = after, dict[tuple[int, ...], Float64]()
+        self._cells = dict[tuple[int, ...], Float64]()
+        if before is not None:
+            points = surface_voxels(before).point * before.voxel_size_m
+            cells, part = np.unique(np.floor(points / CELL_M).astype(np.int64), axis=0, return_inverse=True)
+            order = np.argsort(part.ravel(), kind="stable")
+            pieces = np.split(points[order], np.cumsum(np.bincount(part.ravel()))[:-1])
+            self._cells = dict(zip(map(tuple, cells.tolist()), pieces, strict=True))
+
+    def at(self, point: Float64) -> Float64:
+        """T_after_before (4, 4) round a point (3,)."""
+        key = tuple(np.floor(point / CELL_M).astype(int).tolist())
+        if not self._cells:
+            return np.eye(4)
+        if key not in self._motions:
+            around = (tuple(np.add(key, step).tolist()) for step in np.ndindex(3, 3, 3))
+            near = [self._cells[c] for c in (tuple(np.subtract(c, 1).tolist()) for c in around) if c in self._cells]
+            points = np.concatenate((*near, np.empty((0, 3))))
+            points = points[(np.abs(points - (np.array(key) + 0.5) * CELL_M) < CELL_REACH_M).all(axis=1)]
+            self._motions[key] = _fitted(self._after, points[:: 1 + len(points) // FIT_POINTS])
+        return self._motions[key]
+
+
+def _fitted(snapshot: MapSnapshot, points: Float64) -> Float64:
+    """The motion (4, 4) that brings points (N, 3), world metres, onto the surface; the identity where too few fit.
+
+    Gauss-Newton on the signed distance, with Tukey's weights."""
+    T = np.eye(4)
+    if len(points) < LEAST_FIT:
+        return T
+    middle, size = points.mean(axis=0), snapshot.voxel_size_m
+    for _ in range(FIT_ROUNDS):
+        moved = transform(T, points)
+        distance, gradient = _distance(snapshot, moved / size)
+        inside = np.flatnonzero(np.isfinite(distance) & (np.abs(distance) < FIT_TUKEY))
+        length = np.linalg.norm(gradient[inside], axis=1)
+        inside, length = inside[length > 0.3], length[length > 0.3]
+        if len(inside) < LEAST_FIT:
+            return np.eye(4)
+        d, n = distance[inside] * size, gradient[inside] / length[:, None]
+        weight = (1 - (distance[inside] / FIT_TUKEY) ** 2) ** 2
+        J = np.concatenate((np.cross(moved[inside] - middle, n), n), axis=1)
+        step = np.linalg.solve(J.T @ (J * weight[:, None]) + 1e-3 * np.eye(6), -J.T @ (weight * d))
+        turn = np.eye(4)
+        turn[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
+        turn[:3, 3] = middle + step[3:] - turn[:3, :3] @ middle
+        T = turn @ T
+    angle = np.linalg.norm(scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_rotvec())
+    shift = np.linalg.norm(transform(T, middle[None])[0] - middle)
+    return T if shift <= MOST_FIT_M and angle <= MOST_FIT_RAD else np.eye(4)
+
+
+def _distance(snapshot: MapSnapshot, points: Float64) -> tuple[Float64, Float64]:
+    """Signed distance (N,) in voxels at points (N, 3) in voxels, NaN where not observed, and its gradient (N, 3)."""
+    base = np.floor(points + 0.5).astype(np.int64)
+    steps = np.concatenate((np.zeros((1, 3), np.int64), np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)))
+    voxel = base[None] + steps[:, None]  # (7, N, 3)
+    row, there = find_sorted(snapshot.packed, pack_keys((voxel >> 3).reshape(-1, 3)))
+    x, y, z = (voxel.reshape(-1, 3) & 7).T
+    value = np.full(len(row), np.nan)
+    read = snapshot.voxels.tsdf[snapshot.slots[row[there]], ((z * 8 + y) * 8 + x)[there]].astype(np.float64)
+    value[there] = np.where(read == UNOBSERVED, np.nan, read * (snapshot.truncation_voxels / TSDF_STEPS))
+    value = value.reshape(7, -1)
+    gradient = np.nan_to_num((value[1:4] - value[4:7]).T / 2)
+    return value[0] + ((points - base) * gradient).sum(axis=1), gradient
