@@ -8,8 +8,9 @@ import numpy as np
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import scale_name
 from semantic_mapper.queries.graph import SceneGraph
-from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.objects import ObjectChange, ObjectPlace
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
@@ -86,6 +87,31 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
     return found
 
 
+def answer_changes(since_ns: int, changes: Sequence[ObjectChange]) -> dict[str, Any]:
+    """What was moved, is new, or has gone after a stamp, the surest first."""
+    return {
+        "question": "changes",
+        "since_ns": since_ns,
+        "changes": [
+            {
+                "kind": change.kind,
+                "id": change.object.id,
+                "class": change.object.class_name,
+                "probability": round(change.probability, DIGITS),
+                "before": None if change.before is None else _describe_place(change.before),
+                "now": None if change.kind == "gone" else _describe_place(change.object.places[-1]),
+                "views": change.object.views,
+                "missed": change.object.missed,
+            }
+            for change in changes
+        ],
+    }
+
+
+def _describe_place(place: ObjectPlace) -> dict[str, Any]:
+    return {"since_ns": place.stamp_ns, "room": place.room, "box": _describe_box(place.box)}
+
+
 def answer_graph(graph: SceneGraph) -> dict[str, Any]:
     """Floors, rooms, doors and objects; places are world metres, and ids are those of the tracker."""
     return {
@@ -124,12 +150,13 @@ def _describe_thing(thing: Instance) -> dict[str, Any]:
         "voxels": len(thing.voxels),
         "measured": round(thing.measured, DIGITS),
         "centroid": _rounded(thing.centroid),
-        "box": {
-            "center": _rounded(thing.box.center),
-            "size": _rounded(thing.box.size),
-            "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
-        },
+        "box": _describe_box(thing.box),
     }
+
+
+def _describe_box(box: OrientedBox) -> dict[str, Any]:
+    R = np.round(box.R_world_box, 6).tolist()
+    return {"center": _rounded(box.center), "size": _rounded(box.size), "R_world_box": R}
 
 
 def _rounded(xyz: Float64) -> list[float]:

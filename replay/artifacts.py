@@ -25,7 +25,8 @@ from semantic_mapper.mapping.map_types import MapPoints, computed_fraction, scal
 from semantic_mapper.mapping.open3d_loader import open3d_version
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.graph import find_graph
+from semantic_mapper.queries.objects import remember
+from semantic_mapper.queries.revisit import MapVisit
 from semantic_mapper.replay.overview import ViewStrip, draw_overview, draw_strip
 from semantic_mapper.replay.page import Section, picture, point_view, table_of, write_page
 from semantic_mapper.replay.run_folder import MAP_NAME
@@ -50,6 +51,7 @@ def finish_session(
     stopped_by: str = "",
     restarted: str = "",
     progress: Callable[[], object] = lambda: None,
+    before: MapVisit | None = None,
 ) -> dict[str, Any]:
     """Map what still waits, and write everything to ``out`` (made if missing): the map first, then the summary,
     pictures and the report last. Returns the summary.
@@ -59,7 +61,8 @@ def finish_session(
     MapError: the map cannot be written. ConfigError: the report cannot be written.
 
     ``stopped_by`` says what ended it early, ``restarted`` what became of the map of a process before this one, which
-    the session does not count; empty = nothing. ``progress`` is called after each step.
+    the session does not count; empty = nothing. ``progress`` is called after each step. ``before`` is the map that the
+    session went on in.
     """
     try:
         session.process_rest()
@@ -70,6 +73,8 @@ def finish_session(
     out.mkdir(parents=True, exist_ok=True)
     clear_results(out)
     voxel_map = session.pipeline.voxel_map
+    graph = remember(voxel_map, before)
+    progress()
     voxel_map.save(out / MAP_NAME, progress)
     points = voxel_map.points()
     progress()
@@ -82,8 +87,6 @@ def finish_session(
     elif session.range_warning:
         _log.warning("depth_out_of_range", reason=session.range_warning)
     write_json(out / SUMMARY_FILE, summary)
-    progress()
-    graph = find_graph(voxel_map)
     progress()
     unit = "m" if voxel_map.scale_known else "units"
     poses = [snapshot.T_world_camera for snapshot in session.snapshots]

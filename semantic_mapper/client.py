@@ -19,7 +19,7 @@ from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, Request, Weights
+from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, RememberedObjects, Request, Weights
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.queries.surface import RayHits, costmap
 from semantic_mapper.transport.endpoints import Closing
@@ -129,6 +129,11 @@ class MapClient(Closing):
             key = (self._mirrored, None if up is None else _point(up, "up"))
             tracker = self._graphs.setdefault(key, GraphTracker(up))
         return tracker.update(snapshot, self.instances(tracker.up_in(snapshot)))
+
+    def objects(self, up: ArrayLike | None = None) -> RememberedObjects:
+        """What the map remembers of its things: their places, when they were seen, and those that have gone; brought up
+        to the present first. ``up`` (3,) is by default found by the floor. See ``queries.objects``."""
+        return self._ask(questions.ObjectsRequest(up=None if up is None else _point(up, "up")))
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""

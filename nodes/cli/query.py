@@ -38,6 +38,7 @@ from semantic_mapper.plots import write_picture
 from semantic_mapper.queries.graph import GraphTracker, draw_graph
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, at, nearest
+from semantic_mapper.queries.objects import changes_between, changes_of
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.exporters.map_files import parse_up
@@ -50,7 +51,7 @@ from semantic_mapper.transport.messages import SCALE_UNKNOWN
 _log = get_logger(__name__)
 Up = tuple[float, float, float]
 Things = tuple[Instance, ...]
-Question = Literal["info", "at", "nearest", "instances", "graph", "relocalize"]
+Question = Literal["info", "at", "nearest", "instances", "graph", "changes", "relocalize"]
 ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "relocalize": "LOG"}
 
 
@@ -86,18 +87,21 @@ def query(
     gone: bool = False,  # instances, running mapper: gone ones, too
     unsure: bool = False,  # nearest, instances: also below the least certainty
     picture: Path | None = None,  # graph: also draw it from above (.png)
+    since: Path | None = None,  # changes: map of before; of a running mapper, the one that it goes on in
     every: AtLeastOne = 1,  # relocalize: every n-th frame
 ) -> int:
     """Ask a saved map, or a running mapper, what is where.
 
     info: size and classes. at X Y Z: class at a point, whose box it is in, and whether it is free, occupied or
     unknown. nearest CLASS X Y Z: the nearest surface of a class, and its thing. instances: countable things with
-    upright boxes, certainty and the fraction seen. graph: floors, rooms, doors, and things by room. relocalize LOG:
-    find frames with measured depth in a saved map; exit code 1 where they do not agree.
+    upright boxes, certainty and the fraction seen. graph: floors, rooms, doors, and things by room. changes: what was
+    moved, is new or has gone since another map. relocalize LOG: find frames with measured depth in a saved map; exit
+    code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
     Example: semantic-mapper query runs/demo graph --picture rooms.png
+    Example: semantic-mapper query runs/today changes --since runs/yesterday
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     name, point = _read_arguments(question, arguments or [])
@@ -109,6 +113,7 @@ def query(
         (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
         (picture is not None and question != "graph", "--picture", "goes with `graph`"),
+        (since is not None and (live or question != "changes"), "--since", "goes with `changes` of a saved map"),
     )
     if picture is not None:
         prepare_file(picture)
@@ -117,6 +122,9 @@ def query(
         found = _relocalize(output, source, Path(name), every, live=live)
         located = [session["T_map_world"] is not None for session in found["sessions"]]
         code = 0 if located and all(located) else EXIT_FAILED
+    elif question == "changes" and not live:
+        found = {"map": source, **_saved_changes(source, since)}
+        output.print(answer_table(found))
     else:
         client = MapClient(source, server=remote.server, keys=remote.keys) if live else nullcontext(open_saved(source))
         with client as world_map:
@@ -175,11 +183,25 @@ def answer(
         case "instances":
             axis = _axis(world_map, up)
             return map_answers.answer_instances(axis, _instances(world_map, axis, gone, unsure))
+        case "changes":
+            assert not saved  # see ``_saved_changes``
+            remembered = world_map.objects(up)
+            changes = changes_of(remembered.objects, remembered.since_ns)
+            return map_answers.answer_changes(remembered.since_ns, changes)
         case _:  # the graph
             graph = GraphTracker(up).update(world_map) if saved else world_map.graph(up)
             if picture is not None and graph.floors:
                 write_picture(picture, draw_graph("rooms, doors and objects", graph))
             return map_answers.answer_graph(graph)
+
+
+def _saved_changes(source: str, since: Path | None) -> dict[str, Any]:
+    """What has changed between two saved maps."""
+    if since is None:
+        raise ConfigError("`changes` of a saved map needs the map of before: --since MAP")
+    must_be_there(Path(source), since)
+    before, now = (VoxelMap.load(map_path(path)) for path in (since, Path(source)))
+    return map_answers.answer_changes(before.last_stamp_ns, changes_between(now, before))
 
 
 def _axis(world_map: MapClient | MapSnapshot, up: Up | None) -> Up:
@@ -250,6 +272,8 @@ def answer_table(found: dict[str, Any]) -> Table:
         return _instance_table(found)
     if found["question"] == "graph":
         return _graph_table(found)
+    if found["question"] == "changes":
+        return _change_table(found)
     unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
     plain = {key: value for key, value in found.items() if not isinstance(value, dict)} | _in_words(found)
     plain |= {key: f"{_joined(value)} {unit}" for key, value in plain.items() if isinstance(value, list)}
@@ -307,6 +331,18 @@ def _graph_table(found: dict[str, Any]) -> Table:
     names = ("room", "floor", "area, m2", "doors to", "objects")
     caption = _plain_names(found["objects"]) if found["floors"] else map_answers.NO_FLOOR
     return table(rows, names, title=found["map"], caption=caption)
+
+
+def _change_table(found: dict[str, Any]) -> Table:
+    def place(where: dict[str, Any] | None) -> tuple[object, str]:
+        return ("", "") if where is None else (where["room"] or "", _joined(where["box"]["center"]))
+
+    rows = [
+        (c["kind"], c["id"], c["class"], f"{c['probability'] * 100:.0f} %", *place(c["before"]), *place(c["now"]))
+        for c in found["changes"]
+    ]
+    names = ("", "id", "class", "probability", "room before", "center before, m", "room", "center, m")
+    return table(rows, names, title=found["map"], caption=_plain_names(found["changes"]) or "nothing else has changed")
 
 
 def _plain_names(things: Sequence[dict[str, Any]]) -> str:

@@ -18,6 +18,7 @@ from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, fetch, is_store, is_url
 from semantic_mapper.plain_text import without_secrets
+from semantic_mapper.queries.objects import ObjectMemory
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX, map_path
 from semantic_mapper.types import Float64
 
@@ -52,6 +53,7 @@ def merge_maps(
     known = given or {names[0]: np.eye(4)}
     poses: dict[str, Float64] = {}
     notes: list[str] = []
+    memory = ObjectMemory()
     with tempfile.TemporaryDirectory(prefix="semantic-mapper-merge-") as folder:
         files = {name: fetch(url, Path(folder) / f"{n}.npz") for n, (name, url) in enumerate(sources.items())}
         whole = _empty_map({name: describe_map(file) for name, file in files.items()})
@@ -72,6 +74,7 @@ def merge_maps(
                             f"({where[0]:.2f}, {where[1]:.2f}, {where[2]:.2f}), turned by {turn:.1f} degrees"
                         )
                     whole.add(loaded, T_world_map)
+                    memory.join(ObjectMemory.from_bytes(loaded.objects).moved_by(T_world_map))
                 except MapError as error:
                     refused[name] = str(error)
                     continue
@@ -82,6 +85,7 @@ def merge_maps(
                 reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
                 raise MapError(f"these maps cannot be added; leave them out, or do as it says: {reasons}")
             waiting = list(refused)
+    whole.objects = memory.to_bytes() if len(memory) else b""
     return MergeReport(whole, poses, tuple(notes))
 
 

@@ -25,6 +25,8 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.publishing import PartStatus, PublicPublisher, StatusReport
 from semantic_mapper.nodes.streams import MissingFrames, Streams
+from semantic_mapper.queries.objects import visit_of
+from semantic_mapper.queries.revisit import MapVisit
 from semantic_mapper.replay.artifacts import clear_results, finish_session
 from semantic_mapper.replay.run_folder import MAP_NAME, map_path, prepare_folder
 from semantic_mapper.replay.session import MapSession, Refusal
@@ -66,7 +68,7 @@ class MapperNode(Closing):
         self._context = context
         self._options = options
         self._out = Path(options.out)
-        self._mapper, self._resumed = _load(context, options)
+        self._mapper, self._resumed, self._before = _load(context, options)
         self._pipeline = self._mapper.pipeline
 
         self._session: MapSession | None = None
@@ -102,6 +104,7 @@ class MapperNode(Closing):
                     self._weights or started_with(self._mapper),
                     self._pipeline.moving.space,
                     lambda: self._pipeline.last_pose,
+                    self._before,
                 )
                 self._queries = stack.enter_context(service)
             self._resources = stack.pop_all()
@@ -231,7 +234,8 @@ class MapperNode(Closing):
             self._queries.hand_over()  # questions are answered while the map is written
         if self._weights is not None:
             self._session.learned = to_builtins(self._weights.end())
-        summary = finish_session(self._session, self._out, self._ended_by, self._resumed, self._step_of_results)
+        results = self._session, self._out, self._ended_by, self._resumed, self._step_of_results
+        summary = finish_session(*results, self._before)
         _log.info("map_written", out=str(self._out), **summary["frames"])
         self._publish_status("ended", now=True)
 
@@ -283,8 +287,9 @@ class MapperNode(Closing):
         return PartStatus(counters, tuple(warnings), ages_s)
 
 
-def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
-    """Weights and pipeline, with the map that is continued, and what became of that of a process before this one."""
+def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str, MapVisit | None]:
+    """Weights and pipeline, with the map that is continued; what became of that of a process before this one; and the
+    continued map as it is now."""
     path = Path(options.config) if options.config else None
     given = {
         "voxel_map.voxel_size_m": options.voxel_size_m or None,
@@ -292,7 +297,7 @@ def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
         "depth.refine_in_background": options.delivery == "newest" or None,
     }
     config = load_mapper_config(path, given, {"history.max_frames": options.history_frames})
-    saved = None
+    saved = before = None
     if options.map:
         file = map_path(Path(options.map))
         config = saved_map.stored_settings(config, path, options.voxel_size_m, file)
@@ -300,5 +305,6 @@ def _load(context: NodeContext, options: MapperOptions) -> tuple[Mapper, str]:
     mapper = Mapper.load(Path(options.weights) if options.weights else None, config)
     resumed = saved_map.resume_map(context, Path(options.out) / MAP_NAME, mapper.voxel_map)
     if saved is not None:
+        before = visit_of(saved)
         saved_map.continue_map(mapper.voxel_map, saved, options.map)
-    return mapper, resumed
+    return mapper, resumed, before

@@ -29,12 +29,16 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
+from semantic_mapper.queries.checks import check_up
+from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
+from semantic_mapper.queries.objects import ObjectMemory
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import Request, encode_error
+from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.queries.surface import cast_rays, points_in_box
+from semantic_mapper.queries.surface import cast_rays, points_in_box, up_in
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.sockets import QueryServer
@@ -80,6 +84,7 @@ class QueryService(Closing):
         correction, weights: Take corrected poses and other weights; without them such requests are refused.
         moving: Where something moves now that is left out of the map.
         last_pose: Gives where the last frame was taken.
+        before: The map that this one goes on in, as it was.
     """
 
     def __init__(
@@ -91,6 +96,7 @@ class QueryService(Closing):
         weights: LiveWeights | questions.Weights | None = None,
         moving: MovingSpace | None = None,
         last_pose: Callable[[], CameraPose | None] = lambda: None,
+        before: MapVisit | None = None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._map = voxel_map
@@ -101,6 +107,8 @@ class QueryService(Closing):
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         self._tracker = InstanceTracker()
+        self._before, self._graph = before, GraphTracker()
+        self._remembered: tuple[int, questions.RememberedObjects] | None = None  # with the version of the map
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
@@ -275,6 +283,8 @@ class QueryService(Closing):
                 things = self._tracker.find(snapshot, request.up).things
                 things += self._tracker.gone if request.gone else ()
                 return tuple(thing for thing in things if request.unsure or not thing.unsure)
+            case questions.ObjectsRequest():
+                return self._remember(snapshot, request)
             case questions.OccupancyRequest():
                 return occupancy(snapshot.with_moving(self._moving.points), request.points)
             case questions.DistanceRequest():
@@ -296,6 +306,21 @@ class QueryService(Closing):
                 return self._last_pose()
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
+
+    def _remember(self, snapshot: MapSnapshot, request: questions.ObjectsRequest) -> questions.RememberedObjects:
+        """What the map remembers, with what is there now; costs nothing while the map is the same."""
+        if self._remembered is None or self._remembered[0] != snapshot.version:
+            memory, before = ObjectMemory.from_bytes(self._map.objects), self._before
+            up = up_in(snapshot) if request.up is None else check_up(request.up)
+            things = tuple(thing for thing in self._tracker.find(snapshot, up).things if not thing.unsure)
+            graph = self._graph.update(snapshot, things)
+            looks = Looks.of(self._map.places.places, memory.last_ns)
+            now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns)
+            memory.update(now, up, graph.room_of, before)
+            self._map.objects = memory.to_bytes()
+            since_ns = 0 if before is None else before.stamp_ns
+            self._remembered = snapshot.version, questions.RememberedObjects(memory.objects, since_ns)
+        return self._remembered[1]
 
 
 def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:

@@ -34,7 +34,7 @@ from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
-from semantic_mapper.queries.objects import ObjectChange, ObjectMemory
+from semantic_mapper.queries.objects import ObjectChange, ObjectMemory, changes_of
 from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import PosedFrame
@@ -157,7 +157,7 @@ def visit_of(voxel_map: VoxelMap, since_ns: int) -> MapVisit:
     """A map as it is now, its things, and its views after a stamp."""
     snapshot = MapMirror.of(voxel_map).snapshot()
     looks = Looks.of(voxel_map.places.places, since_ns)
-    return MapVisit(snapshot, InstanceTracker(up=UP).update(snapshot), looks)
+    return MapVisit(snapshot, InstanceTracker(up=UP).update(snapshot), looks, voxel_map.last_stamp_ns)
 
 
 class Report(NamedTuple):
@@ -182,8 +182,9 @@ def reports_of(changes: Sequence[ObjectChange]) -> list[Report]:
 def compare(before: MapVisit, after: MapVisit) -> list[Report]:
     """What the product finds."""
     memory = ObjectMemory()
-    memory.update(before, UP, 1)
-    return reports_of(memory.update(after, UP, 2, before=before))
+    memory.update(before, UP)
+    memory.update(after, UP, before=before)
+    return reports_of(changes_of(memory.objects, before.stamp_ns))
 
 
 class Score(NamedTuple):

@@ -211,7 +211,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined, self.places, self.objects = other.refined, other.places, other.objects
+            self.refined, self.places, self.objects = other.refined, other.places, other.objects or self.objects
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 

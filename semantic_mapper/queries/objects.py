@@ -15,6 +15,11 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.localization.places import shared_places
+from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.mapping.map_types import require_metres
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import OrientedBox
 from semantic_mapper.queries.revisit import (
     GONE_FREE,
@@ -23,6 +28,7 @@ from semantic_mapper.queries.revisit import (
     SIGNATURE,
     Candidate,
     Fit,
+    Looks,
     MapVisit,
     find_evidence,
     match_candidates,
@@ -31,6 +37,7 @@ from semantic_mapper.queries.revisit import (
     sample_points,
     signature_of,
 )
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.transport.images import zstd_compress, zstd_decompress
 from semantic_mapper.types import Float64, UInt8
 
@@ -74,6 +81,7 @@ class MapObject:
     missed: int = 0  # views of its place since in which it was not to be seen
     gone_ns: int | None = None  # when its place was first seen without it; None = it is there
     appeared: bool = False  # whether its first place had been seen without it before
+    certainty: float = 1.0  # probability of its last change: that it was moved, has gone or came
     seen: float = 1.0  # fraction of its outside that was seen, at best; its signature is of then
 
     @property
@@ -123,6 +131,7 @@ class _Row(msgspec.Struct, frozen=True, array_like=True):
     missed: int
     gone_ns: int | None
     appeared: bool
+    certainty: float
     seen: float
 
 
@@ -166,21 +175,20 @@ class ObjectMemory:
         self,
         now: MapVisit,
         up: Float64,
-        stamp_ns: int,
         rooms: Mapping[int, int | None] = MappingProxyType({}),
         before: MapVisit | None = None,
-    ) -> tuple[ObjectChange, ...]:
-        """Take over what is seen now; returns what has changed since the last update, the surest first.
+    ) -> None:
+        """Take over what is seen now.
 
         Args:
             now: The map as it is, its things, and the views since the last update.
             up: (3,) unit vector, along which boxes stand.
-            stamp_ns: Of the last frame.
             rooms: Id of the room of each thing, by id of the thing.
             before: The map of the last visit and its views, in the same world; without it nothing is known to be new,
                 and surfaces are not fitted to each other.
         """
-        old, fit = self.there, Fit(None if before is None else before.snapshot, now.snapshot)
+        stamp_ns, old = now.stamp_ns, self.there
+        fit = Fit(None if before is None else before.snapshot, now.snapshot)
         points = [sample_points(thing, now.snapshot) for thing in now.things]
         same = overlapping([o.surface for o in old], points, lambda i, j: old[i].class_id == now.things[j].class_id)
         still = {j for _, j in same}
@@ -205,36 +213,69 @@ class ObjectMemory:
         away = [o for o in self.objects if o.gone_ns is not None]
         rows = [*goers.values(), *(Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature) for o in away)]
         sources, targets = [*(old[i] for i in goers), *away], list(comers)
-        left, came, changes = set[int](), set[int](), list[ObjectChange]()
+        left, came = set[int](), set[int]()
         for r, c, probability in match_candidates(rows, list(comers.values())):
             thing, j = sources[r], targets[c]
-            moved = _refreshed(thing, now, j, up, stamp_ns, rooms)
+            moved = _refreshed(thing, now, j, up, rooms)
             place = ObjectPlace(stamp_ns, moved.box, moved.room)
-            moved = replace(moved, places=(*thing.places, place)[-MAX_PLACES:], missed=0, gone_ns=None)
+            places = (*thing.places, place)[-MAX_PLACES:]
+            moved = replace(moved, places=places, missed=0, gone_ns=None, certainty=probability)
             self._objects[thing.id] = moved
             left.add(thing.id)
             came.add(j)
-            changes.append(ObjectChange("moved", moved, thing.places[-1], probability))
         for i, goer in goers.items():
             thing = old[i]
             if thing.id not in left and goer.free >= GONE_FREE:
-                self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=max(1, missed[i]))
+                self._objects[thing.id] = replace(
+                    thing, gone_ns=stamp_ns, missed=thing.missed + max(1, missed[i]), certainty=goer.free
+                )
                 left.add(thing.id)
-                changes.append(ObjectChange("gone", self._objects[thing.id], thing.places[-1], goer.free))
         for i, j in same:
             if old[i].id not in left and j not in came:
-                self._objects[old[i].id] = _refreshed(old[i], now, j, up, stamp_ns, rooms)
+                self._objects[old[i].id] = _refreshed(old[i], now, j, up, rooms)
                 came.add(j)
         for j in range(len(now.things)):
             if j not in came:
                 appeared = before is not None and j in comers and comers[j].free >= GONE_FREE
-                made = replace(_remembered(self._next_id, now, j, up, stamp_ns, rooms), appeared=appeared)
-                self._objects[made.id] = made
+                made = _remembered(self._next_id, now, j, up, rooms)
+                certainty = comers[j].free if appeared else 1.0
+                self._objects[made.id] = replace(made, appeared=appeared, certainty=certainty)
                 self._next_id += 1
-                if appeared:
-                    changes.append(ObjectChange("new", made, None, comers[j].free))
         self._forget()
-        return tuple(sorted(changes, key=lambda change: -change.probability))
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last update that saw something; the least stamp of an empty memory."""
+        return max((thing.last_seen_ns for thing in self._objects.values()), default=-(2**63))
+
+    def moved_by(self, T_new_old: Float64) -> ObjectMemory:
+        """The same objects where the world is another one, at ``T_new_old`` (4, 4)."""
+        return ObjectMemory((_moved_by(thing, T_new_old) for thing in self._objects.values()), self._next_id)
+
+    def join(self, other: ObjectMemory) -> None:
+        """Take over the objects of another map of the same world. What is there in both, at one place and of one class,
+        is one object, with the id of here; others get new ids."""
+        ours, theirs = self.there, other.objects
+        there = [k for k, thing in enumerate(theirs) if thing.gone_ns is None]
+        points = [theirs[k].surface for k in there]
+        pairs = overlapping(
+            [o.surface for o in ours], points, lambda i, j: ours[i].class_id == theirs[there[j]].class_id
+        )
+        same = {there[j]: ours[i] for i, j in pairs if ours[i].class_id == theirs[there[j]].class_id}
+        for k, thing in enumerate(theirs):
+            if (known := same.get(k)) is None:
+                self._objects[self._next_id] = replace(thing, id=self._next_id)
+                self._next_id += 1
+                continue
+            later = max(known, thing, key=lambda o: o.last_seen_ns)
+            self._objects[known.id] = replace(
+                later,
+                id=known.id,
+                first_seen_ns=min(known.first_seen_ns, thing.first_seen_ns),
+                views=known.views + thing.views,
+                missed=known.missed + thing.missed,
+            )
+        self._forget()
 
     def to_bytes(self) -> bytes:
         """For a file; see ``from_bytes``."""
@@ -268,9 +309,85 @@ class ObjectMemory:
                 del self._objects[thing.id]
 
 
-def _remembered(
-    number: int, now: MapVisit, j: int, up: Float64, stamp_ns: int, rooms: Mapping[int, int | None]
-) -> MapObject:
+def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph | None:
+    """The graph of a finished map, with its things taken over into what the map remembers (``VoxelMap.objects``); None,
+    and nothing is taken over, where its lengths are not metres, or nothing in it is known to be floor. ``before`` as of
+    ``ObjectMemory.update``. Raises MapError: what the map remembers is damaged."""
+    memory = ObjectMemory.from_bytes(voxel_map.objects)
+    if not voxel_map.scale_known:
+        return None
+    tracker = GraphTracker()
+    try:
+        if before is not None:
+            graph = tracker.update(before.snapshot)
+            if not len(memory):
+                memory.update(before._replace(things=graph.things), graph.up, graph.room_of)
+        snapshot = MapMirror.of(voxel_map).snapshot()
+        graph = tracker.update(snapshot)
+    except MapError:
+        return None
+    stamp_ns = voxel_map.last_stamp_ns
+    looks = Looks.of(voxel_map.places.places, memory.last_ns)
+    memory.update(MapVisit(snapshot, graph.things, looks, stamp_ns), graph.up, graph.room_of, before)
+    voxel_map.objects = memory.to_bytes()
+    return graph
+
+
+def visit_of(voxel_map: VoxelMap) -> MapVisit:
+    """A map as it is now and all views that it keeps, without its things."""
+    places = voxel_map.places.places
+    return MapVisit(MapMirror.of(voxel_map).snapshot(), (), Looks.of(places), voxel_map.last_stamp_ns)
+
+
+def changes_of(objects: Iterable[MapObject], since_ns: int) -> tuple[ObjectChange, ...]:
+    """What has become of objects after a stamp, the surest first."""
+    found: list[ObjectChange] = []
+    for thing in objects:
+        known = thing.first_seen_ns <= since_ns
+        earlier = [place for place in thing.places if place.stamp_ns <= since_ns]
+        if known and thing.gone_ns is not None and thing.gone_ns > since_ns:
+            found.append(ObjectChange("gone", thing, (earlier or thing.places)[-1], thing.certainty))
+        elif known and thing.gone_ns is None and thing.places[-1].stamp_ns > since_ns:
+            found.append(ObjectChange("moved", thing, (earlier or thing.places)[-1], thing.certainty))
+        elif not known and thing.gone_ns is None and thing.appeared:
+            found.append(ObjectChange("new", thing, None, thing.certainty))
+    return tuple(sorted(found, key=lambda change: (-change.probability, change.object.id)))
+
+
+def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[ObjectChange, ...]:
+    """What has become of the things of a map of before in a later one, which goes on in it or is of the same place.
+
+    Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
+    ``before``; else it then remembers what this finds. Raises MapError: ``now`` is not later, the maps do not fit each
+    other, nobody knows how they lie, or it has no metres or no floor."""
+    since, ours, theirs = before.last_stamp_ns, *(ObjectMemory.from_bytes(m.objects) for m in (now, before))
+    if now.last_stamp_ns <= since:
+        raise MapError(f"the last frame of the map ({now.last_stamp_ns} ns) is not later than that of before ({since})")
+    if len(theirs) and all((o := ours.get(t.id)) and o.first_seen_ns == t.first_seen_ns for t in theirs.objects):
+        return changes_of(ours.objects, since)
+    if not shared_places(now.places.places, before.places.places):
+        T = find_alignment(now, before).T_map_other
+        aligned = VoxelMap(now.config, now.label_set)
+        aligned.add(before, T)
+        before, theirs = aligned, theirs.moved_by(T)
+    now.objects = theirs.to_bytes()
+    require_metres(now.scale_known, "changes")
+    if remember(now, visit_of(before)) is None:
+        raise MapError("changes: no floor was found, by which it is known which way is up")
+    return changes_of(ObjectMemory.from_bytes(now.objects).objects, since)
+
+
+def _moved_by(thing: MapObject, T: Float64) -> MapObject:
+    R = T[:3, :3]
+
+    def moved(box: OrientedBox) -> OrientedBox:
+        return OrientedBox(transform(T, box.center), box.size, R @ box.R_world_box)
+
+    places = tuple(replace(place, box=moved(place.box)) for place in thing.places)
+    return replace(thing, box=moved(thing.box), places=places, points=np.round(thing.points @ R.T).astype(np.int16))
+
+
+def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[int, int | None]) -> MapObject:
     """A thing of now as a new object."""
     thing, snapshot = now.things[j], now.snapshot
     offsets = (sample_points(thing, snapshot, POINTS) - thing.box.center) * 1000
@@ -285,20 +402,18 @@ def _remembered(
         color=snapshot.voxels.rgb[slot, voxel].mean(axis=0).astype(np.uint8),
         signature=signature_of(snapshot, thing, up),
         points=np.clip(np.round(offsets), -32767, 32767).astype(np.int16),
-        first_seen_ns=stamp_ns,
-        last_seen_ns=stamp_ns,
+        first_seen_ns=now.stamp_ns,
+        last_seen_ns=now.stamp_ns,
         views=1,
         room=room,
-        places=(ObjectPlace(stamp_ns, thing.box, room),),
+        places=(ObjectPlace(now.stamp_ns, thing.box, room),),
         seen=thing.seen,
     )
 
 
-def _refreshed(
-    old: MapObject, now: MapVisit, j: int, up: Float64, stamp_ns: int, rooms: Mapping[int, int | None]
-) -> MapObject:
+def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mapping[int, int | None]) -> MapObject:
     """An object that is seen as a thing of now; at the place of before, as far as its history goes."""
-    made, weight = _remembered(old.id, now, j, up, stamp_ns, rooms), min(old.views, MEMORY_VIEWS)
+    made, weight = _remembered(old.id, now, j, up, rooms), min(old.views, MEMORY_VIEWS)
     odds = {number: p * weight for number, p in old.classes}
     odds[made.class_id] = odds.get(made.class_id, 0.0) + made.probability
     classes = sorted(((n, p / (weight + 1)) for n, p in odds.items()), key=lambda c: -c[1])[:MAX_CLASSES]
@@ -318,6 +433,7 @@ def _refreshed(
         views=old.views + 1,
         places=(*old.places[:-1], place),
         appeared=old.appeared,
+        certainty=old.certainty,
         seen=best.seen,
     )
 
@@ -337,6 +453,7 @@ def _row_of(thing: MapObject) -> _Row:
         thing.missed,
         thing.gone_ns,
         thing.appeared,
+        thing.certainty,
         thing.seen,
     )
 
@@ -362,6 +479,7 @@ def _object_of(row: _Row) -> MapObject:
         missed=row.missed,
         gone_ns=row.gone_ns,
         appeared=row.appeared,
+        certainty=row.certainty,
         seen=row.seen,
     )
 

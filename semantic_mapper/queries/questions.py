@@ -24,6 +24,7 @@ from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.objects import MapObject
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.codec import check_header, pack_header, unpack_header
@@ -73,7 +74,7 @@ class MapState(Wire, frozen=True):
 
 
 class _ArraySpec(Wire, frozen=True):
-    dtype: Literal["|b1", "|u1", "|i1", "<i4", "<i8", "<f4", "<f8"]
+    dtype: Literal["|b1", "|u1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"]
     shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(min_length=1, max_length=4)]
     start: PartBytes
     bytes: PartBytes
@@ -139,6 +140,15 @@ class Weights:
     versions: tuple[WeightsEntry, ...]  # all that it knows of, the oldest first
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RememberedObjects:
+    """What a map remembers of its things, and the last stamp of the map that it goes on in (0 = of none): what came of
+    them since is ``queries.objects.changes_of``."""
+
+    objects: tuple[MapObject, ...]
+    since_ns: int
+
+
 class InfoRequest(Request[MapInfo], frozen=True, kw_only=True):
     """What the map is."""
 
@@ -183,6 +193,13 @@ class InstancesRequest(Request[tuple[Instance, ...]], frozen=True, kw_only=True)
     up: Point
     gone: bool = False
     unsure: bool = False
+
+
+class ObjectsRequest(Request[RememberedObjects], frozen=True, kw_only=True):
+    """What the map remembers of its things; ``up`` (3,), None = by the floor."""
+
+    takes_long: ClassVar[bool] = True
+    up: Point | None = None
 
 
 class OccupancyRequest(Request[UInt8], frozen=True, kw_only=True):
@@ -255,6 +272,7 @@ QUESTIONS = {
     "cast_rays": Question(RaysRequest, RayHits),
     "points_in_box": Question(BoxRequest, MapPoints),
     "instances": Question(InstancesRequest, tuple[Instance, ...]),
+    "objects": Question(ObjectsRequest, RememberedObjects),
     "occupancy": Question(OccupancyRequest, UInt8),
     "distance_field": Question(DistanceRequest, DistanceField),
     "changes": Question(ChangesRequest, BlockChanges),

@@ -100,11 +100,12 @@ class Looks:
 
 
 class MapVisit(NamedTuple):
-    """A state of a map, its things, and the views that it comes of."""
+    """A state of a map, its things, the views that it comes of, and the stamp of the last frame."""
 
     snapshot: MapSnapshot
     things: Sequence[Instance]
     looks: Looks
+    stamp_ns: int
 
 
 class Evidence(NamedTuple):
