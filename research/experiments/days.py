@@ -40,7 +40,7 @@ from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import PosedFrame
 
 SPLITS = {"tune": range(60_000, 60_006), "test": range(80_000, 80_020)}
-FRAMES = 100  # of a visit to a room
+FRAMES = 160  # of a visit to a room
 WIDTH, OWN_WIDTH = 160, 320  # of images
 LEAST_FRAMES, LEAST_PIXELS = 3, 50  # of 160 x 120
 UP = np.array((0.0, 0.0, 1.0))

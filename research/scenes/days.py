@@ -84,7 +84,7 @@ def visit(
     intrinsics: CameraIntrinsics,
     noise: NoiseConfig | None,
     errors: Sequence[Float64] = (),
-    step_m: float = 0.14,
+    step_m: float = 0.09,
 ) -> Iterator[tuple[int, RoomView]]:
     """The frames of one visit with their rooms; another ``seed`` begins elsewhere and goes another way.
 

@@ -30,10 +30,10 @@ from semantic_mapper.queries.revisit import (
     Fit,
     Looks,
     MapVisit,
+    color_of,
     find_evidence,
     match_candidates,
     overlapping,
-    read_thing,
     sample_points,
     signature_of,
 )
@@ -42,7 +42,7 @@ from semantic_mapper.transport.images import zstd_compress, zstd_decompress
 from semantic_mapper.types import Float64, UInt8
 
 MAX_OBJECTS = 10_000
-MAX_PLACES = 8  # that an object keeps of its history
+MAX_PLACES = 4  # that an object keeps of its history
 MAX_CLASSES = 4  # that an object keeps the probabilities of
 POINTS = 96  # of its surface that an object keeps, at most
 MAX_BYTES = 50 << 20  # of a memory in a file, unpacked
@@ -200,18 +200,24 @@ class ObjectMemory:
             missed[i] = evidence.looks
             if evidence.known >= LEAST_KNOWN and evidence.fraction_free >= SHIFTED_FREE:
                 center = transform(T_now_then(), thing.surface).mean(axis=0)
-                goers[i] = Candidate(thing.class_id, thing.box.size, center, evidence.fraction_free, thing.signature)
+                looks = thing.signature, thing.color
+                goers[i] = Candidate(thing.class_id, thing.box.size, center, evidence.fraction_free, *looks)
+        began = stamp_ns if before is None else before.stamp_ns
+        settled = {j for i, j in same if old[i].places[-1].stamp_ns > began}  # came in an earlier update since
         for j, thing in enumerate(now.things):
+            if j in settled:
+                continue
             free = 0.0 if j in still else 1.0
             if before is not None:
                 T = partial(fit.at, points[j].mean(axis=0))
                 evidence = find_evidence(before, points[j], lambda T=T, j=j: transform(invert_pose(T()), points[j]))
                 free = evidence.fraction_free if evidence.known >= LEAST_KNOWN else 0.0
             if free >= SHIFTED_FREE:
-                sign = signature_of(now.snapshot, thing, up)
-                comers[j] = Candidate(thing.class_id, thing.box.size, points[j].mean(axis=0), free, sign)
+                looks = signature_of(now.snapshot, thing, up), color_of(now.snapshot, thing)
+                comers[j] = Candidate(thing.class_id, thing.box.size, points[j].mean(axis=0), free, *looks)
         away = [o for o in self.objects if o.gone_ns is not None]
-        rows = [*goers.values(), *(Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature) for o in away)]
+        gone_before = (Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature, o.color) for o in away)
+        rows = [*goers.values(), *gone_before]
         sources, targets = [*(old[i] for i in goers), *away], list(comers)
         left, came = set[int](), set[int]()
         for r, c, probability in match_candidates(rows, list(comers.values())):
@@ -230,6 +236,8 @@ class ObjectMemory:
                     thing, gone_ns=stamp_ns, missed=thing.missed + max(1, missed[i]), certainty=goer.free
                 )
                 left.add(thing.id)
+            elif thing.id not in left and missed[i]:
+                self._objects[thing.id] = replace(thing, missed=thing.missed + missed[i])
         for i, j in same:
             if old[i].id not in left and j not in came:
                 self._objects[old[i].id] = _refreshed(old[i], now, j, up, rooms)
@@ -392,14 +400,13 @@ def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[
     thing, snapshot = now.things[j], now.snapshot
     offsets = (sample_points(thing, snapshot, POINTS) - thing.box.center) * 1000
     room = rooms.get(thing.id)
-    _, slot, voxel = read_thing(snapshot, thing)
     return MapObject(
         id=number,
         class_id=thing.class_id,
         class_name=thing.class_name,
         classes=((thing.class_id, thing.confidence),),
         box=thing.box,
-        color=snapshot.voxels.rgb[slot, voxel].mean(axis=0).astype(np.uint8),
+        color=color_of(snapshot, thing),
         signature=signature_of(snapshot, thing, up),
         points=np.clip(np.round(offsets), -32767, 32767).astype(np.int16),
         first_seen_ns=now.stamp_ns,

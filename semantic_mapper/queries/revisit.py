@@ -3,8 +3,8 @@
 A thing of before has gone where what is seen now lies behind its surface; a thing of now has come where what was seen
 before did. So what could not have been seen has neither gone nor come. Surfaces of before are first fitted to those of
 now round each thing, since poses of two visits differ by some centimetres. What has gone and what has come are then
-matched as a whole (linear assignment) by class, size, shape and colour; a pair that costs ``MOST_COST`` or more is one
-thing that has gone and another that is new."""
+matched as a whole (linear assignment) by class, size, shape and colour; a pair that is
+unlikely to be one thing is one that has gone and another that is new."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, surface_voxels
-from semantic_mapper.types import Bool, Float64, Int64
+from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 NEAR_M = 0.08  # of the points of two things at one place
 OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of two classes; at least
 GONE_FREE = 0.6  # of what is known of its place: a thing of which so much is free is not there
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
-MOST_COST = 1.0  # of a pair that is one thing
+LEAST_ODDS = -0.5  # logarithm, of a pair that is taken for one thing
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are asked whether they see through it
 LEAST_LOOKS = 1
@@ -42,9 +42,14 @@ FIT_POINTS, LEAST_FIT, FIT_ROUNDS = 3000, 300, 8
 FIT_TUKEY = 2.5  # voxels
 MOST_FIT_M, MOST_FIT_RAD = 0.08, 0.03
 LEAST_SHIFT_M = 0.06  # things that have been moved by less have not been moved
-CHROMA, LIGHT, SPREAD, RISE = 6, 12, 24, 16  # bins of a signature
-SIGNATURE = CHROMA**2 + LIGHT + SPREAD + RISE
-PARTS = np.cumsum((CHROMA**2, LIGHT, SPREAD))
+CHROMA, LIGHT, DROP = 8, 12, 16  # bins of a signature
+SIGNATURE = CHROMA**2 + LIGHT + DROP
+PARTS = np.cumsum((CHROMA**2, LIGHT))
+HUE_RANGE, DARK = 1.2, 8.0
+LEAST_SIDE_M = 0.04
+FOOT_M = 0.13  # by which the height of one thing may differ: its foot is hidden, or not yet in the map
+# chroma, hue, light, bright, drop, high, level, class
+WEIGHTS, DIFFERENT = np.array((2.7, 1.3, 1.7, 2.5, 2.4, 3.3, 5.0, 2.7)), 3.0
 FACES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
 
 
@@ -134,6 +139,7 @@ class Candidate(NamedTuple):
     center: Float64  # (3,) mean of its surface, in the world of now
     free: float  # of what is known of its place in the other map
     signature: NDArray[np.int8]
+    color: UInt8  # (3,)
 
 
 def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) -> list[tuple[int, int, float]]:
@@ -149,52 +155,66 @@ def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) ->
 
 
 def _likelihood(cost: float) -> float:
-    return float(1 / (1 + np.exp(6 * (cost - MOST_COST))))
+    return float(1 / (1 + np.exp(cost - DIFFERENT)))
 
 
 def _assign(cost: Float64) -> list[tuple[int, int]]:
-    """Pairs of rows and columns of the least total cost, where none costs ``MOST_COST``."""
-    rows, columns = cost.shape
+    """Pairs of rows and columns of the least total cost, where a row and a column without a pair cost as one of the
+    least odds."""
+    (rows, columns), most = cost.shape, DIFFERENT - LEAST_ODDS
     if not rows or not columns:
         return []
     whole = np.full((rows + columns, rows + columns), 0.0)
     whole[:rows, :columns] = np.minimum(cost, 1e3)
-    whole[:rows, columns:] = whole[rows:, :columns] = MOST_COST / 2
+    whole[:rows, columns:] = whole[rows:, :columns] = most / 2
     found = zip(*scipy.optimize.linear_sum_assignment(whole), strict=True)
-    return [(int(r), int(c)) for r, c in found if r < rows and c < columns and cost[r, c] < MOST_COST]
+    return [(int(r), int(c)) for r, c in found if r < rows and c < columns and cost[r, c] < most]
 
 
 def pair_cost(a: Candidate, b: Candidate) -> float:
-    """How different two things look: about 0.3 of one thing seen twice, 1 and more of two different ones."""
+    """How different two things look: the logarithm of their odds of being one is ``DIFFERENT`` less this. The weights
+    are of a logistic regression over homes that no figure is of."""
     parts = (np.split(c.signature.astype(np.float64) / 127, PARTS) for c in (a, b))
-    chroma, light, spread, rise = (1 - float(x @ y) for x, y in zip(*parts, strict=True))
-    size_a, size_b = (np.maximum([*np.sort(c.size[:2]), c.size[2]], 0.04) for c in (a, b))
-    size = float(np.abs(np.log(size_a / size_b)).mean())
-    return 0.8 * chroma + 0.2 * light + 1.0 * spread + 0.8 * rise + 0.8 * size + 0.6 * (a.class_id != b.class_id)
+    chroma, light, drop = (1 - float(x @ y) for x, y in zip(*parts, strict=True))
+    (hue_a, light_a), (hue_b, light_b) = (_tone(c.color[None]) for c in (a, b))
+    hue, bright = float(np.linalg.norm(hue_a - hue_b)), abs(float(light_a[0] - light_b[0]))
+    level_a, level_b = (np.maximum(np.sort(c.size[:2]), LEAST_SIDE_M) for c in (a, b))
+    level = float(np.abs(np.log(level_a / level_b)).mean())
+    high = max(0.0, abs(float(a.size[2] - b.size[2])) - FOOT_M) / max(float(a.size[2]), float(b.size[2]), 0.1)
+    differences = np.array((chroma, hue, light, bright, drop, high, level, a.class_id != b.class_id))
+    return float(WEIGHTS @ differences)
 
 
 def signature_of(snapshot: MapSnapshot, thing: Instance, up: Float64) -> NDArray[np.int8]:
-    """(SIGNATURE,) int8: four histograms of unit length, times 127: of hue and saturation, of lightness against its
-    median, of distances between its points, and of their heights above its foot."""
+    """(SIGNATURE,) int8: three histograms of unit length, times 127: of hue and saturation, of lightness against its
+    median, and of depths below its top (its foot is often hidden)."""
     points, slot, voxel = read_thing(snapshot, thing)
-    rgb = snapshot.voxels.rgb[slot, voxel].astype(np.float64) + 8.0
-    log = np.log(rgb)
-    plane = np.stack((log[:, 0] - log[:, 1], log[:, 2] - log[:, 1]), axis=1)
-    cell = np.clip(np.floor((plane / 1.2 + 0.5) * CHROMA), 0, CHROMA - 1).astype(np.int64)
-    lightness = log.mean(axis=1)
-    lightness -= np.median(lightness)
-    rng = np.random.default_rng(0)
-    a, b = rng.integers(len(points), size=(2, 3000))
-    spread = np.log2(np.maximum(np.linalg.norm(points[a] - points[b], axis=1), 0.02) / 0.02) * 4
+    hue, lightness = _tone(snapshot.voxels.rgb[slot, voxel])
+    at = np.clip((hue / HUE_RANGE + 0.5) * CHROMA - 0.5, 0, CHROMA - 1.001)
+    low = np.floor(at).astype(np.int64)
+    part = at - low
+    chroma = np.zeros((CHROMA, CHROMA))
+    for x, y in np.ndindex(2, 2):  # each is shared by the four bins round it
+        np.add.at(chroma, (low[:, 0] + x, low[:, 1] + y), np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1]))
     height = points @ up
-    rise = (height - np.percentile(height, 1)) / 0.06
     histograms = (
-        np.bincount(cell[:, 0] * CHROMA + cell[:, 1], minlength=CHROMA**2),
-        _histogram((lightness + 1.2) / 0.2, LIGHT),
-        _histogram(spread, SPREAD),
-        _histogram(rise, RISE),
+        chroma.ravel(),
+        _histogram((lightness - np.median(lightness) + 1.2) / 0.2, LIGHT),
+        _histogram((np.percentile(height, 99) - height) / 0.06, DROP),
     )
-    return np.concatenate([np.sqrt(h / max(1, h.sum())) * 127 for h in histograms]).round().astype(np.int8)
+    return np.concatenate([np.sqrt(h / max(1.0, h.sum())) * 127 for h in histograms]).round().astype(np.int8)
+
+
+def color_of(snapshot: MapSnapshot, thing: Instance) -> UInt8:
+    """(3,) uint8 mean RGB of its surface."""
+    _, slot, voxel = read_thing(snapshot, thing)
+    return snapshot.voxels.rgb[slot, voxel].mean(axis=0).astype(np.uint8)
+
+
+def _tone(rgb: NDArray[np.generic]) -> tuple[Float64, Float64]:
+    """Hue and saturation (N, 2) and lightness (N,) of colours (N, 3), as logarithms: other light shifts them."""
+    log = np.log(rgb.astype(np.float64) + DARK)
+    return np.stack((log[:, 0] - log[:, 1], log[:, 2] - log[:, 1]), axis=1), log.mean(axis=1)
 
 
 def _histogram(values: Float64, bins: int) -> Int64:

@@ -1,0 +1,163 @@
+"""Objects keep their id over visits: what was moved, came or has gone in a house whose plan is known."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import invert_pose, yaw_transform
+from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.objects import MAX_OBJECTS, MAX_PLACES, MapObject, ObjectMemory, changes_of
+from semantic_mapper.queries.revisit import Looks, MapVisit
+from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.types import Float64
+from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, Box, house_changes, two_rooms
+
+UP = np.array((0.0, 0.0, 1.0))
+TABLE = np.array((5.0, 0.9, 0.35))  # centre of the one that ``two_rooms`` has
+CHEST = (0.5, 0.5, 0.4)
+BENCH = (1.0, 0.3, 0.3)
+DESK = (0.6, 0.4, 0.9)
+
+
+def box(size: tuple[float, float, float], x: float, y: float, name: str = "table") -> Box:
+    """On the floor, with a corner at (x, y)."""
+    return name, (x, y, 0.0), (x + size[0], y + size[1], size[2])
+
+
+def visit(boxes: Sequence[Box], stamp_ns: int, places: Sequence[Place] = ()) -> MapVisit:
+    snapshot = MapMirror(VOXEL_M, TRUNCATION, LABELS).apply(house_changes(boxes, 0))
+    return MapVisit(snapshot, InstanceTracker(up=UP).update(snapshot, unsure=True), Looks.of(places), stamp_ns)
+
+
+def two_visits(first: Sequence[Box], second: Sequence[Box]) -> tuple[ObjectMemory, dict[str, list[MapObject]]]:
+    """The memory after both, and what it says has changed."""
+    memory, before = ObjectMemory(), visit(first, 10)
+    memory.update(before, UP)
+    assert not changes_of(memory.objects, 10)
+    memory.update(visit(second, 20), UP, before=before)
+    found: dict[str, list[MapObject]] = {"moved": [], "new": [], "gone": []}
+    for change in changes_of(memory.objects, 10):
+        found[change.kind].append(change.object)
+        assert 0 < change.probability <= 1 and (change.before is None) == (change.kind == "new")
+    return memory, found
+
+
+def test_what_was_moved_came_and_went_is_told_apart() -> None:
+    memory, found = two_visits(
+        [*two_rooms(), box(CHEST, 0.3, 0.3), box(BENCH, 0.4, 2.3)],
+        [*two_rooms(), box(CHEST, 4.0, 2.0), box(DESK, 1.2, 0.2)],
+    )
+    (chest,), (desk,), (bench,) = (found[kind] for kind in ("moved", "new", "gone"))
+    then, now = chest.places
+    np.testing.assert_allclose(then.box.center, (0.55, 0.55, 0.2), atol=0.08)
+    np.testing.assert_allclose(now.box.center, (4.25, 2.25, 0.2), atol=0.08)
+    assert (then.stamp_ns, now.stamp_ns, chest.first_seen_ns, chest.last_seen_ns) == (10, 20, 10, 20)
+    assert (bench.gone_ns, bench.last_seen_ns, desk.first_seen_ns, desk.appeared) == (20, 10, 20, True)
+    assert chest.id < desk.id and bench.missed >= 1 and chest.missed == 0
+    (table,) = [o for o in memory.there if np.linalg.norm(o.box.center - TABLE) < 0.1]
+    assert table.views == 2 and len(table.places) == 1 and memory.get(table.id) is table
+
+
+def test_what_was_brought_back_is_what_was_taken_away() -> None:
+    with_bench = [*two_rooms(), box(BENCH, 0.4, 2.3)]
+    memory, found = two_visits(with_bench, two_rooms())
+    (bench,) = found["gone"]
+    memory.update(visit([*two_rooms(), box(BENCH, 1.4, 0.4)], 30), UP, before=visit(two_rooms(), 20))
+    (change,) = changes_of(memory.objects, 20)
+    assert (change.kind, change.object.id, change.object.gone_ns) == ("moved", bench.id, None)
+
+
+def test_nothing_has_gone_that_could_not_be_seen() -> None:
+    memory, found = two_visits([*two_rooms(), box(CHEST, 4.0, 2.2)], two_rooms(east=False))
+    assert found == {"moved": [], "new": [], "gone": []} and len(memory.there) == 2
+
+
+def test_a_room_seen_for_the_first_time_is_not_full_of_new_things() -> None:
+    memory, found = two_visits(two_rooms(east=False), two_rooms())
+    assert not found["new"] and [o.appeared for o in memory.there] == [False]
+
+
+@pytest.mark.parametrize("shift", [(0.02, 0.0, 0.0), (-0.012, 0.012, 0.01), (0.0, 0.03, 0.0)])
+def test_a_pose_error_moves_nothing(shift: tuple[float, float, float]) -> None:
+    house = [*two_rooms(), box(CHEST, 0.3, 0.3), box(BENCH, 0.4, 2.3)]
+    off = [(name, tuple(np.add(low, shift)), tuple(np.add(high, shift))) for name, low, high in house]
+    _, found = two_visits(house, off)
+    assert found == {"moved": [], "new": [], "gone": []}
+
+
+def test_a_view_tells_what_is_free_far_from_all_surfaces() -> None:
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = np.array(((0, 0, 1), (-1, 0, 0), (0, -1, 0)))  # along x
+    T_world_camera[:3, 3] = (0.3, 0.8, 1.2)
+    corners = np.array([(x, y, 2.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)], np.float32)
+    place = Place("front", 5, T_world_camera, corners, np.zeros((4, DESCRIPTOR_BYTES), np.uint8))
+    seen = visit(two_rooms(), 10, (place,))
+    points = np.array([(1.5, 0.8, 1.2), (1.5, 0.8, 1.3), (3.5, 0.8, 1.2), (0.1, 0.8, 1.2)])
+    free, through = seen.looks.through(seen.snapshot, points)
+    assert free.tolist() == [1, 1, 0, 0]  # in the room; behind its wall; behind the camera
+    assert through == 1 and not len(Looks.of((place,), after_ns=5).poses)
+
+
+def full_memory() -> ObjectMemory:
+    memory = ObjectMemory()
+    memory.update(visit([*two_rooms(), box(CHEST, 0.3, 0.3)], 10), UP, {})
+    return memory
+
+
+def test_a_memory_is_the_same_after_it_was_saved() -> None:
+    memory, _ = two_visits([*two_rooms(), box(CHEST, 0.3, 0.3)], [*two_rooms(), box(CHEST, 4.0, 2.0)])
+    loaded = ObjectMemory.from_bytes(memory.to_bytes())
+    assert loaded.to_bytes() == memory.to_bytes() and len(loaded) == len(memory) == 2
+    for one, other in zip(memory.objects, loaded.objects, strict=True):
+        assert (one.id, one.classes, one.class_name, one.views) == (
+            other.id,
+            other.classes,
+            other.class_name,
+            other.views,
+        )
+        np.testing.assert_array_equal(one.signature, other.signature)
+        np.testing.assert_allclose(one.surface, other.surface)
+        assert [p.stamp_ns for p in one.places] == [p.stamp_ns for p in other.places]
+    assert ObjectMemory.from_bytes(b"").objects == ()
+
+
+@pytest.mark.parametrize("damage", [lambda d: d[:-3], lambda d: d[:10], lambda d: b"\xff\xff\xff\xff" + d[4:]])
+def test_a_damaged_memory_is_refused(damage) -> None:
+    with pytest.raises(MapError, match="object memory"):
+        ObjectMemory.from_bytes(damage(full_memory().to_bytes()))
+
+
+def test_ten_thousand_objects_take_less_than_50_mb_and_more_are_not_kept() -> None:
+    first = full_memory().objects[0]
+    places = first.places * MAX_PLACES
+    many = [replace(first, id=n + 1, places=places, views=n, signature=first.signature.copy()) for n in range(10_005)]
+    memory = ObjectMemory(many)
+    memory.join(ObjectMemory())
+    assert len(memory) == MAX_OBJECTS and memory.get(1) is None and memory.get(10_005) is not None
+    data = memory.to_bytes()
+    del memory, many
+    tracemalloc.start()
+    loaded = ObjectMemory.from_bytes(data)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(loaded) == MAX_OBJECTS and held < 50e6 and len(data) < 50e6
+
+
+def test_merged_memories_have_what_is_in_both_once() -> None:
+    T: Float64 = yaw_transform(np.array((4.0, -3.0, 0.0)), 90.0)
+    ours, theirs = full_memory(), ObjectMemory()
+    theirs.update(visit([*two_rooms(), box(DESK, 1.2, 0.2)], 30), UP)
+    away = ObjectMemory.from_bytes(theirs.to_bytes()).moved_by(invert_pose(T))
+    assert np.linalg.norm(away.objects[0].box.center - theirs.objects[0].box.center) > 1
+    ours.join(away.moved_by(T))
+    table, chest, desk = ours.objects
+    assert (table.first_seen_ns, table.last_seen_ns, table.views) == (10, 30, 2)
+    assert (chest.last_seen_ns, desk.first_seen_ns, desk.id) == (10, 30, 3)
+    np.testing.assert_allclose(desk.box.center, (1.5, 0.4, 0.45), atol=0.08)
