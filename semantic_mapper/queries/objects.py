@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -20,22 +20,26 @@ from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
-from semantic_mapper.queries.instances import OrientedBox
+from semantic_mapper.queries.instances import OTHER, OrientedBox
 from semantic_mapper.queries.revisit import (
+    FIXTURES,
     GONE_FREE,
-    LEAST_KNOWN,
     SHIFTED_FREE,
     SIGNATURE,
     Candidate,
+    Evidence,
     Fit,
     Looks,
     MapVisit,
     color_of,
     find_evidence,
+    joined,
     match_candidates,
     overlapping,
+    parted,
     sample_points,
     signature_of,
+    touching,
 )
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.transport.images import zstd_compress, zstd_decompress
@@ -178,7 +182,7 @@ class ObjectMemory:
         rooms: Mapping[int, int | None] = MappingProxyType({}),
         before: MapVisit | None = None,
     ) -> None:
-        """Take over what is seen now.
+        """Take over what is seen now. ``FIXTURES`` are never reported as moved, gone or new.
 
         Args:
             now: The map as it is, its things, and the views since the last update.
@@ -189,39 +193,35 @@ class ObjectMemory:
         """
         stamp_ns, old = now.stamp_ns, self.there
         fit = Fit(None if before is None else before.snapshot, now.snapshot)
+        taken = list[MapObject]()  # parts of objects that may have left, without ids yet
+        if before is not None:
+            wholes, parts = parted(now, before, lambda xyz: transform(invert_pose(fit.at(xyz.mean(axis=0))), xyz), up)
+            now = now._replace(things=[*wholes, *(part for part, _ in parts)])
+            taken = self._taken_parts(before, now, fit, up)
+        came_free = self._came(now, before, fit)
+        if before is not None:
+            now, came_free = _joined(now, came_free)
         points = [sample_points(thing, now.snapshot) for thing in now.things]
         same = overlapping([o.surface for o in old], points, lambda i, j: old[i].class_id == now.things[j].class_id)
-        still = {j for _, j in same}
-        goers, comers = dict[int, Candidate](), dict[int, Candidate]()
-        missed: dict[int, int] = {}
-        for i, thing in enumerate(old):
-            T_now_then = partial(fit.at, thing.box.center)
-            evidence = find_evidence(now, thing.surface, lambda T=T_now_then, o=thing: transform(T(), o.surface))
-            missed[i] = evidence.looks
-            if evidence.known >= LEAST_KNOWN and evidence.fraction_free >= SHIFTED_FREE:
-                center = transform(T_now_then(), thing.surface).mean(axis=0)
-                looks = thing.signature, thing.color
-                goers[i] = Candidate(thing.class_id, thing.box.size, center, evidence.fraction_free, *looks)
+        goers, missed = self._goers(old, now, fit)
         began = stamp_ns if before is None else before.stamp_ns
-        settled = {j for i, j in same if old[i].places[-1].stamp_ns > began}  # came in an earlier update since
+        still = {j for i, j in same if before is None or old[i].places[-1].stamp_ns > began}
+        comers = dict[int, Candidate]()
         for j, thing in enumerate(now.things):
-            if j in settled:
-                continue
-            free = 0.0 if j in still else 1.0
-            if before is not None:
-                T = partial(fit.at, points[j].mean(axis=0))
-                evidence = find_evidence(before, points[j], lambda T=T, j=j: transform(invert_pose(T()), points[j]))
-                free = evidence.fraction_free if evidence.known >= LEAST_KNOWN else 0.0
-            if free >= SHIFTED_FREE:
+            if j not in still and came_free[j] >= SHIFTED_FREE:
                 looks = signature_of(now.snapshot, thing, up), color_of(now.snapshot, thing)
-                comers[j] = Candidate(thing.class_id, thing.box.size, points[j].mean(axis=0), free, *looks)
+                center = points[j].mean(axis=0)
+                comers[j] = Candidate(thing.class_id, thing.box.size, center, came_free[j], *looks)
         away = [o for o in self.objects if o.gone_ns is not None]
         gone_before = (Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature, o.color) for o in away)
-        rows = [*goers.values(), *gone_before]
-        sources, targets = [*(old[i] for i in goers), *away], list(comers)
+        of_parts = (Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature, o.color) for o in taken)
+        rows = [*goers.values(), *of_parts, *gone_before]
+        sources, targets = [*(old[i] for i in goers), *taken, *away], list(comers)
         left, came = set[int](), set[int]()
         for r, c, probability in match_candidates(rows, list(comers.values())):
-            thing, j = sources[r], targets[c]
+            thing, j = self._with_id(sources[r]), targets[c]
+            if sources[r] in taken:
+                taken.remove(sources[r])
             moved = _refreshed(thing, now, j, up, rooms)
             place = ObjectPlace(stamp_ns, moved.box, moved.room)
             places = (*thing.places, place)[-MAX_PLACES:]
@@ -238,8 +238,11 @@ class ObjectMemory:
                 left.add(thing.id)
             elif thing.id not in left and missed[i]:
                 self._objects[thing.id] = replace(thing, missed=thing.missed + missed[i])
+        for part in taken:
+            thing = self._with_id(part)
+            self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=1)
         for i, j in same:
-            if old[i].id not in left and j not in came:
+            if old[i].id in self._objects and old[i].id not in left and j not in came:
                 self._objects[old[i].id] = _refreshed(old[i], now, j, up, rooms)
                 came.add(j)
         for j in range(len(now.things)):
@@ -250,6 +253,52 @@ class ObjectMemory:
                 self._objects[made.id] = replace(made, appeared=appeared, certainty=certainty)
                 self._next_id += 1
         self._forget()
+
+    def _goers(self, old: Sequence[MapObject], now: MapVisit, fit: Fit) -> tuple[dict[int, Candidate], dict[int, int]]:
+        """Those of some objects that may have left, and how many views see each one's place without it, by position.
+        Small things that left as several pieces are one object from now on: that of the largest."""
+        evidence = dict[int, Evidence]()
+        for i, thing in enumerate(old):
+            T = partial(fit.at, thing.box.center)
+            evidence[i] = find_evidence(now, thing.surface, lambda T=T, o=thing: transform(T(), o.surface))
+        left = [i for i, e in evidence.items() if old[i].class_name not in FIXTURES and e.free_of >= SHIFTED_FREE]
+        whole = [i for i in left if evidence[i].free_of >= GONE_FREE and old[i].class_name == OTHER]
+        for group in touching([old[i].surface for i in whole]):
+            for i in sorted((whole[k] for k in group), key=lambda i: -float(np.prod(old[i].box.size)))[1:]:
+                left.remove(i)
+                del self._objects[old[i].id]
+        found = dict[int, Candidate]()
+        for i in left:
+            thing = old[i]
+            center = transform(fit.at(thing.box.center), thing.surface).mean(axis=0)
+            looks = thing.signature, thing.color
+            found[i] = Candidate(thing.class_id, thing.box.size, center, evidence[i].free_of, *looks)
+        return found, {i: e.looks for i, e in evidence.items()}
+
+    def _came(self, now: MapVisit, before: MapVisit | None, fit: Fit) -> list[float]:
+        """How much of the place of each thing of now was free before; without a map of before, all."""
+        free = list[float]()
+        for thing in now.things:
+            points = sample_points(thing, now.snapshot)
+            if before is None or thing.class_name in FIXTURES:
+                free.append(0.0 if before is not None else 1.0)
+                continue
+            T = partial(fit.at, points.mean(axis=0))
+            free.append(find_evidence(before, points, lambda T=T, p=points: transform(invert_pose(T()), p)).free_of)
+        return free
+
+    def _with_id(self, thing: MapObject) -> MapObject:
+        """An object that has its id, a new one where it had none."""
+        if not thing.id:
+            thing = replace(thing, id=self._next_id)
+            self._next_id += 1
+        return thing
+
+    def _taken_parts(self, before: MapVisit, now: MapVisit, fit: Fit, up: Float64) -> list[MapObject]:
+        """Parts of things of before that are free now, as objects without an id (0)."""
+        _, parts = parted(before, now, lambda xyz: transform(fit.at(xyz.mean(axis=0)), xyz), up)
+        from_parts = before._replace(things=[part for part, _ in parts])
+        return [_remembered(0, from_parts, k, up, {}) for k in range(len(parts))]
 
     @property
     def last_ns(self) -> int:
@@ -317,6 +366,18 @@ class ObjectMemory:
                 del self._objects[thing.id]
 
 
+def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:
+    """Small things of which pieces came together as one each, and how much of the place of each was free."""
+    whole = [j for j, f in enumerate(free) if f >= GONE_FREE]
+    points = [sample_points(now.things[j], now.snapshot) for j in whole]
+    groups = [[whole[k] for k in g] for g in touching(points) if len(g) > 1]
+    gone = {j for group in groups for j in group}
+    kept = [j for j in range(len(free)) if j not in gone]
+    ones = [joined([now.things[j] for j in group], now.snapshot.voxel_size_m) for group in groups]
+    things = [*(now.things[j] for j in kept), *ones]
+    return now._replace(things=things), [*(free[j] for j in kept), *(max(free[j] for j in g) for g in groups)]
+
+
 def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph | None:
     """The graph of a finished map, with its things taken over into what the map remembers (``VoxelMap.objects``); None,
     and nothing is taken over, where its lengths are not metres, or nothing in it is known to be floor. ``before`` as of
@@ -328,8 +389,9 @@ def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph 
     try:
         if before is not None:
             graph = tracker.update(before.snapshot)
+            before = before._replace(things=graph.things)
             if not len(memory):
-                memory.update(before._replace(things=graph.things), graph.up, graph.room_of)
+                memory.update(before, graph.up, graph.room_of)
         snapshot = MapMirror.of(voxel_map).snapshot()
         graph = tracker.update(snapshot)
     except MapError:

@@ -9,32 +9,36 @@ unlikely to be one thing is one that has gone and another that is new."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # loads `optimize` when it is first used
 from numpy.typing import NDArray
 
-from semantic_mapper.geometry import transform
+from semantic_mapper.geometry import transform, turn_onto
 from semantic_mapper.localization.places import Place
 from semantic_mapper.mapping.blocks import find_sorted, pack_keys
 from semantic_mapper.mapping.changes import TSDF_STEPS, UNOBSERVED
-from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.instances import OTHER, Instance, upright_box
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, surface_voxels
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
-NEAR_M = 0.08  # of the points of two things at one place
+PART_FREE = 0.08  # of a thing, from which on it is looked for parts that were or are not there
+PART_VOXELS, PART_SIDE_M, PART_GAP = 60, 0.06, 1.8  # of a part at least; its shortest side; gap within, voxels
+MOST_PART, MOST_PARTED = 0.9, 20_000  # of a thing; voxels of one that is looked at
+NEAR_M = 0.08  # of the points of two things at one place, or what their spacing is
 OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of two classes; at least
-GONE_FREE = 0.6  # of what is known of its place: a thing of which so much is free is not there
+GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is free is not there
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
 LEAST_ODDS = -0.5  # logarithm, of a pair that is taken for one thing
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are asked whether they see through it
-LEAST_LOOKS = 1
+LEAST_LOOKS = 2
+TOUCH_M = 0.04  # small pieces that came, or left, together and are so near to each other are one thing
 BEHIND_M = 0.1  # a view sees through a point where it meets the surface so far behind it
 REACH_M, PAST_M = 5.0, 1.5  # of a view, and how far past a point it is followed
 CELL_M, CELL_REACH_M = 2.0, 1.8  # surfaces are fitted in cells of this size, by what is so near to their middle
@@ -50,6 +54,8 @@ LEAST_SIDE_M = 0.04
 FOOT_M = 0.13  # by which the height of one thing may differ: its foot is hidden, or not yet in the map
 # chroma, hue, light, bright, drop, high, level, class
 WEIGHTS, DIFFERENT = np.array((2.7, 1.3, 1.7, 2.5, 2.4, 3.3, 5.0, 2.7)), 3.0
+# Parts of the building, which nobody carries; what is found of them differs from visit to visit.
+FIXTURES = frozenset("window door curtain blinds showercurtain counter bathtub sink toilet".split())
 FACES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
 
 
@@ -121,14 +127,10 @@ class Evidence(NamedTuple):
     looks: int  # views that see through most of what they have of them in view
 
     @property
-    def known(self) -> float:
-        """Fraction that is known."""
-        return float((self.free | self.solid).mean())
-
-    @property
-    def fraction_free(self) -> float:
-        """Of those known."""
-        return float(self.free.sum() / max(1, (self.free | self.solid).sum()))
+    def free_of(self) -> float:
+        """Fraction free of those known; 0 where too few are."""
+        known = int((self.free | self.solid).sum())
+        return float(self.free.sum() / known) if known >= LEAST_KNOWN * len(self.free) else 0.0
 
 
 class Candidate(NamedTuple):
@@ -256,6 +258,64 @@ def _states(snapshot: MapSnapshot, voxels: Float64) -> tuple[Bool, Bool]:
     return (states[0] == State.FREE) & ~solid, solid
 
 
+def parted(
+    visit: MapVisit, other: MapVisit, lie: Callable[[Float64], Float64], up: Float64
+) -> tuple[list[Instance], list[tuple[Instance, int]]]:
+    """The things of a visit without parts that the other map has free: small things that stood so near to others that
+    they are one piece; and those parts, each with the position of its thing. ``lie`` brings points (N, 3) of this
+    map to where they lie in the other."""
+    wholes, parts = list[Instance](), list[tuple[Instance, int]]()
+    size = visit.snapshot.voxel_size_m
+    for k, thing in enumerate(visit.things):
+        wholes.append(thing)
+        if thing.class_name != OTHER:
+            continue
+        free, solid = _states(other.snapshot, sample_points(thing, visit.snapshot) / size)
+        if not PART_FREE <= free.sum() / max(1, (free | solid).sum()) < GONE_FREE or len(thing.voxels) > MOST_PARTED:
+            continue
+        xyz = thing.voxels.astype(np.float64) * size
+        free, _ = _states(other.snapshot, lie(xyz) / size)
+        at, taken = np.flatnonzero(free), np.zeros(len(xyz), np.bool_)
+        pairs = scipy.spatial.KDTree(xyz[at]).query_pairs(PART_GAP * size, output_type="ndarray")
+        graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(at), len(at)))
+        _, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        for n in np.flatnonzero(np.bincount(number, minlength=1) >= PART_VOXELS):
+            rows = at[number == n]
+            part = _piece(thing, xyz, rows, up)
+            if part.box.size.min() >= PART_SIDE_M and len(rows) <= MOST_PART * len(xyz):
+                parts.append((part, k))
+                taken[rows] = True
+        if taken.any():
+            wholes[-1] = _piece(thing, xyz, np.flatnonzero(~taken), up)
+    return wholes, parts
+
+
+def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
+    """Some of the voxels (N,) of a thing, which lie at (N, 3), as a thing."""
+    frame = thing.box.R_world_box
+    if abs(float(frame[:, 2] @ up)) < 0.99:
+        frame = turn_onto(np.array((0.0, 0.0, 1.0)), up)
+    box = upright_box(xyz[rows], frame)
+    return replace(thing, voxels=thing.voxels[rows], box=box, centroid=xyz[rows].mean(axis=0))
+
+
+def touching(points: Sequence[Float64]) -> list[list[int]]:
+    """Groups of pieces, of points (N, 3), whose boxes touch."""
+    ends = [(p.min(axis=0) - TOUCH_M, p.max(axis=0)) for p in points]
+    groups: list[list[int]] = []
+    for k, (low, high) in enumerate(ends):
+        near = [g for g in groups if any((ends[m][0] <= high).all() and (low <= ends[m][1]).all() for m in g)]
+        groups = [g for g in groups if g not in near] + [[*(m for g in near for m in g), k]]
+    return groups
+
+
+def joined(pieces: Sequence[Instance], voxel_m: float) -> Instance:
+    """Pieces of one thing as one, with the id of the largest."""
+    largest, voxels = max(pieces, key=lambda t: len(t.voxels)), np.concatenate([t.voxels for t in pieces])
+    xyz = voxels.astype(np.float64) * voxel_m
+    return replace(largest, voxels=voxels, box=upright_box(xyz, largest.box.R_world_box), centroid=xyz.mean(axis=0))
+
+
 def overlapping(
     before: Sequence[Float64], now: Sequence[Float64], same_class: Callable[[int, int], bool]
 ) -> list[tuple[int, int]]:
@@ -265,10 +325,11 @@ def overlapping(
         ends = [np.array([(p.min(axis=0), p.max(axis=0)) for p in points]) for points in (before, now)]
         meet = (ends[0][:, None, 0] < ends[1][None, :, 1] + 0.05) & (ends[1][None, :, 0] < ends[0][:, None, 1] + 0.05)
         trees = [[scipy.spatial.KDTree(p) for p in points] for points in (before, now)]
+        reach = [[_reach(tree) for tree in of_visit] for of_visit in trees]
         for i, j in np.argwhere(meet.all(axis=2)).tolist():
             one, other = (
-                np.isfinite(tree.query(p, distance_upper_bound=NEAR_M)[0]).mean()
-                for tree, p in ((trees[1][j], before[i]), (trees[0][i], now[j]))
+                np.isfinite(tree.query(p, distance_upper_bound=limit)[0]).mean()
+                for tree, p, limit in ((trees[1][j], before[i], reach[1][j]), (trees[0][i], now[j], reach[0][i]))
             )
             score = float(one * other) * (1.0 if same_class(i, j) else OTHER_CLASS)
             if score >= LEAST_SCORE:
@@ -280,6 +341,12 @@ def overlapping(
             used[0].add(i)
             used[1].add(j)
     return found
+
+
+def _reach(tree: Any) -> float:
+    """How far points of the same surface may lie from the points of a tree, metres."""
+    spacing = tree.query(tree.data, 2)[0][:, 1] if tree.n > 1 else np.zeros(1)
+    return max(NEAR_M, 1.2 * float(np.median(spacing)))
 
 
 class Fit:

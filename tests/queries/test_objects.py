@@ -157,7 +157,7 @@ def test_merged_memories_have_what_is_in_both_once() -> None:
     away = ObjectMemory.from_bytes(theirs.to_bytes()).moved_by(invert_pose(T))
     assert np.linalg.norm(away.objects[0].box.center - theirs.objects[0].box.center) > 1
     ours.join(away.moved_by(T))
-    table, chest, desk = ours.objects
+    chest, table, desk = ours.objects
     assert (table.first_seen_ns, table.last_seen_ns, table.views) == (10, 30, 2)
     assert (chest.last_seen_ns, desk.first_seen_ns, desk.id) == (10, 30, 3)
     np.testing.assert_allclose(desk.box.center, (1.5, 0.4, 0.45), atol=0.08)
