@@ -2,7 +2,7 @@
 
     python -m research.experiments.days --split test
     python -m research.experiments.days --split test --own    # labels of S-Ray instead of the true ones
-    python -m research.experiments.days --split test --apart  # two maps instead of one that goes on
+    python -m research.experiments.days --split test --goes-on  # one map of both visits instead of two maps
 
 Homes of ``scenes.days``. Poses of the second visit are off by 2 cm and 0.5 degrees in each room. A change counts where
 it could be seen: the thing in ``LEAST_FRAMES`` frames of ``LEAST_PIXELS`` or more, and through its place in as many of
@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -244,21 +244,17 @@ def show(scores: Sequence[Score]) -> None:
         print(f"{kind:6s} {true:4d} true, {reported:4d} reported, {right:4d} right: F1 {f1:.2f}")
 
 
-def homes(arguments: argparse.Namespace, *, changes: bool) -> Iterator[Score]:
-    """The score of each home."""
-    seeds = SPLITS[arguments.split][: arguments.homes]
-    for seed in seeds:
-        before, after, truth = map_days(seed, changes=changes, own=arguments.own, apart=arguments.apart)
-        began = time.perf_counter()
-        reports = compare(before, after)
-        took = time.perf_counter() - began
-        score = judge(reports, truth, arguments.say)
-        print(
-            f"home {seed}: {score.right.total()} of {score.true.total()} found, "
-            f"{score.reported.total() - score.right.total()} false, {took:.1f} s",
-            flush=True,
-        )
-        yield score
+def score_home(seed: int, arguments: argparse.Namespace, *, changes: bool) -> Score:
+    """Map a home twice and compare."""
+    before, after, truth = map_days(seed, changes=changes, own=arguments.own, apart=not arguments.goes_on)
+    began = time.perf_counter()
+    reports = compare(before, after)
+    took = time.perf_counter() - began
+    score = judge(reports, truth, arguments.say)
+    right, reported, true = (getattr(score, name).total() for name in Score._fields)
+    what = f"{right} of {true} found, {reported - right} false" if changes else f"unchanged, {reported} false"
+    print(f"home {seed}: {what}, {took:.1f} s", flush=True)
+    return score
 
 
 def main() -> None:
@@ -267,11 +263,14 @@ def main() -> None:
     parser.add_argument("--split", choices=tuple(SPLITS), default="tune")
     parser.add_argument("--homes", type=int, default=20)
     parser.add_argument("--own", action="store_true", help="labels of S-Ray")
-    parser.add_argument("--apart", action="store_true", help="the second visit makes a map of its own")
+    parser.add_argument("--goes-on", action="store_true", help="the second visit goes on in the map of the first")
     parser.add_argument("--say", action="store_true", help="name each error")
     arguments = parser.parse_args()
-    show(list(homes(arguments, changes=True)))
-    false = [s.reported.total() for s in homes(arguments, changes=False)]
+    changed, false = list[Score](), list[int]()
+    for seed in SPLITS[arguments.split][: arguments.homes]:
+        changed.append(score_home(seed, arguments, changes=True))
+        false.append(score_home(seed, arguments, changes=False).reported.total())
+    show(changed)
     print(f"unchanged: {sum(n > 0 for n in false)} of {len(false)} homes with a false change, {sum(false)} in all")
 
 

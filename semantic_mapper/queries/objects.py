@@ -172,7 +172,7 @@ class ObjectMemory:
         return tuple(thing for thing in self.objects if thing.gone_ns is None)
 
     def get(self, number: int) -> MapObject | None:
-        """The object of an id; None where there is none, or it was forgotten."""
+        """The object of an id; None where no object has it, or it was forgotten."""
         return self._objects.get(number)
 
     def update(

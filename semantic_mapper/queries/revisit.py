@@ -34,9 +34,9 @@ OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of 
 GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is free is not there
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
-LEAST_ODDS = -0.5  # logarithm, of a pair that is taken for one thing
+LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
 COMPARED = 400  # surface voxels of a thing, at most
-LOOKS = 12  # views of a place that are asked whether they see through it
+LOOKS = 12  # views of a place that are called whether they see through it
 LEAST_LOOKS = 2
 TOUCH_M = 0.04  # small pieces that came, or left, together and are so near to each other are one thing
 BEHIND_M = 0.1  # a view sees through a point where it meets the surface so far behind it
@@ -53,7 +53,7 @@ HUE_RANGE, DARK = 1.2, 8.0
 LEAST_SIDE_M = 0.04
 FOOT_M = 0.13  # by which the height of one thing may differ: its foot is hidden, or not yet in the map
 # chroma, hue, light, bright, drop, high, level, class
-WEIGHTS, DIFFERENT = np.array((2.7, 1.3, 1.7, 2.5, 2.4, 3.3, 5.0, 2.7)), 3.0
+WEIGHTS, DIFFERENT = np.array((4.3, 0.2, 1.1, 3.2, 4.6, 2.8, 6.8, 0.6)), 3.9
 # Parts of the building, which nobody carries; what is found of them differs from visit to visit.
 FIXTURES = frozenset("window door curtain blinds showercurtain counter bathtub sink toilet".split())
 FACES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
@@ -239,7 +239,7 @@ def sample_points(thing: Instance, snapshot: MapSnapshot, most: int = COMPARED) 
 
 def find_evidence(visit: MapVisit, points: Float64, fitted: Callable[[], Float64]) -> Evidence:
     """What is known in a map of points (N, 3), world metres; ``fitted`` gives them as they lie where the surfaces of
-    both maps are fitted, and is asked where they seem not to be there."""
+    both maps are fitted, and is called where they seem not to be there."""
     voxel_m = visit.snapshot.voxel_size_m
     free, solid = _states(visit.snapshot, points / voxel_m)
     if 2 * solid.sum() > len(points) and free.sum() < SHIFTED_FREE * (free | solid).sum():
@@ -350,7 +350,7 @@ def _reach(tree: Any) -> float:
 
 
 class Fit:
-    """How surfaces of one map lie in another: a motion for each cell, found when it is first asked for; without a map
+    """How surfaces of one map lie in another: a motion for each cell, found when it is first needed; without a map
     of before, as they are."""
 
     def __init__(self, before: MapSnapshot | None, after: MapSnapshot) -> None:

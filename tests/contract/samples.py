@@ -10,8 +10,10 @@ from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, MapPoints
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+from semantic_mapper.queries.objects import MapObject, ObjectPlace
 from semantic_mapper.queries.occupancy import DistanceField
-from semantic_mapper.queries.questions import Correction, MapInfo, MapState, Weights, WeightsEntry
+from semantic_mapper.queries.questions import Correction, MapInfo, MapState, RememberedObjects, Weights, WeightsEntry
+from semantic_mapper.queries.revisit import SIGNATURE
 from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.messages import (
     EndOfStream,
@@ -110,6 +112,7 @@ def questions() -> dict[str, dict[str, Any]]:
         "cast_rays": {**who, "max_m": 7.5, "origins": points, "directions": points[::-1].copy()},
         "points_in_box": {**who, **box},
         "instances": {**who, "up": (0.0, 0.0, 1.0)},
+        "objects": {**who, "up": (0.0, 0.0, 1.0)},
         "occupancy": {**who, "points": points},
         "pose": who,
         "distance_field": {**who, **box, "unknown_is_occupied": True},
@@ -157,6 +160,9 @@ def answers() -> dict[str, Any]:
     box = OrientedBox(center, size, rng.random((3, 3)))
     voxels = np.array([[1, 2, 3], [4, 5, -6]], np.int32)
     thing = Instance(4, 9, "counter top", 0.75, rng.random(3), box, voxels)
+    place = ObjectPlace(3, box, 2)
+    looks = rgb[0], np.arange(SIGNATURE, dtype=np.int8), np.array([[5, -6, 700]], np.int16)
+    remembered = MapObject(4, 9, "counter top", ((9, 0.75),), box, *looks, 3, 8, 2, 2, (place,), certainty=0.5)
     changes = BlockChanges(
         since=3,
         version=7,
@@ -176,6 +182,7 @@ def answers() -> dict[str, Any]:
         "cast_rays": RayHits(far, u8, f4, rgb, measured),
         "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
         "instances": (thing,),
+        "objects": RememberedObjects((remembered,), 5),
         "occupancy": u8 % 3,
         "pose": CameraPose("rooms", 7, np.eye(4)),
         "distance_field": DistanceField(np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3),

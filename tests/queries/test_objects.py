@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,14 +10,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semantic_mapper.client import MapClient
+from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, yaw_transform
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.objects import MAX_OBJECTS, MAX_PLACES, MapObject, ObjectMemory, changes_of
+from semantic_mapper.queries.objects import (
+    MAX_OBJECTS,
+    MAX_PLACES,
+    MapObject,
+    ObjectMemory,
+    changes_of,
+    remember,
+    visit_of,
+)
 from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64
+from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, Box, house_changes, two_rooms
 
 UP = np.array((0.0, 0.0, 1.0))
@@ -161,3 +174,30 @@ def test_merged_memories_have_what_is_in_both_once() -> None:
     assert (table.first_seen_ns, table.last_seen_ns, table.views) == (10, 30, 2)
     assert (chest.last_seen_ns, desk.first_seen_ns, desk.id) == (10, 30, 3)
     np.testing.assert_allclose(desk.box.center, (1.5, 0.4, 0.45), atol=0.08)
+
+
+def test_a_running_mapper_says_what_was_moved_since_the_map_that_it_goes_on_in() -> None:
+    def saved(thing: Box, stamp_ns: int) -> VoxelMap:
+        made = VoxelMap(VoxelMapConfig(voxel_size_m=VOXEL_M), LABELS)
+        made.add(VoxelMap.received(house_changes([*two_rooms(), thing], 0), VOXEL_M, LABELS), np.eye(4))
+        made.last_stamp_ns = stamp_ns
+        return made
+
+    now = saved(box(CHEST, 0.3, 0.3), 10)
+    remember(now)
+    before = visit_of(now)
+    with (
+        a_folder() as folder,
+        answering(f"ipc://{folder / 'q'}", now, before=before) as service,
+        MapClient(service.endpoint, timeout_s=20.0) as client,
+    ):
+        first = client.objects()
+        assert first.since_ns == 10 and not changes_of(first.objects, 10) and len(first.objects) == 2
+        now.take_over(saved(box(CHEST, 4.0, 2.0), 20))
+        until = time.monotonic() + 20
+        while not (changes := changes_of(client.objects().objects, 10)) and time.monotonic() < until:
+            time.sleep(0.05)  # answers are about the map of a moment ago
+        (change,) = changes
+    assert change.kind == "moved" and change.object.id in {o.id for o in first.objects}
+    remembered = ObjectMemory.from_bytes(now.objects).get(change.object.id)
+    assert remembered is not None and len(remembered.places) == 2 and remembered.room == change.object.room

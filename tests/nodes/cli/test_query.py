@@ -10,9 +10,11 @@ import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import answer, answer_table, open_saved
 from semantic_mapper.queries import instances
+from semantic_mapper.queries.objects import ObjectMemory, remember
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
@@ -22,7 +24,7 @@ from tests.mapping.rendered_views import small_map
 from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import refused, run, run_ok
-from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, house_changes, two_rooms
+from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, Box, house_changes, two_rooms
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
 
 
@@ -141,6 +143,31 @@ def test_nearest_names_the_thing_that_instances_and_the_graph_list(monkeypatch: 
             assert find.call_count == (world_map is not client), "once a map"
         assert len(seen) >= 14 and seen[: len(seen) // 2] == seen[len(seen) // 2 :]
         assert {t.id for t in client.instances((0.0, 0.5, 1.0))} == {t["id"] for t in listed}, "whatever is up"
+
+
+def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
+    chest: Box = ("table", (0.3, 0.3, 0.0), (0.8, 0.8, 0.4))
+    moved: Box = ("table", (4.0, 2.0, 0.0), (4.5, 2.5, 0.4))
+    view = Place("front", 1, np.eye(4), np.ones((1, 3), np.float32), np.zeros((1, DESCRIPTOR_BYTES), np.uint8))
+    for name, stamp_ns, thing in (("yesterday", 10, chest), ("today", 20, moved)):
+        saved = VoxelMap.received(house_changes([*two_rooms(), thing], 0), VOXEL_M, LABELS)
+        saved.last_stamp_ns = stamp_ns
+        saved.places.add(view)  # both are in one world
+        remember(saved)
+        saved.save(tmp_path / f"{name}.npz")
+    found, shown = ask(tmp_path / "today.npz", "changes", "--since", tmp_path / "yesterday.npz")
+    (change,) = found["changes"]
+    assert (found["since_ns"], change["kind"], change["class"], change["before"]["room"]) == (10, "moved", "table", 1)
+    np.testing.assert_allclose(change["before"]["box"]["center"], (0.55, 0.55, 0.2), atol=0.08)
+    np.testing.assert_allclose(change["now"]["box"]["center"], (4.25, 2.25, 0.2), atol=0.08)
+    yesterday = ObjectMemory.from_bytes(VoxelMap.load(tmp_path / "yesterday.npz").objects)
+    kept = yesterday.get(change["id"])
+    assert kept is not None and "moved" in shown and "room" in shown
+    np.testing.assert_allclose(kept.box.center, change["before"]["box"]["center"], atol=1e-4)
+    assert "not later" in refused("query", tmp_path / "yesterday.npz", "changes", "--since", tmp_path / "today.npz")
+    assert "--since MAP" in refused("query", tmp_path / "today.npz", "changes")
+    said = refused("query", tmp_path / "today.npz", "info", "--since", tmp_path / "today.npz", code=2)
+    assert "goes with `changes`" in said
 
 
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from semantic_mapper.queries.questions import (
     RaysRequest,
     encode_request,
 )
+from semantic_mapper.queries.revisit import MapVisit
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.sockets import MAX_REQUEST_BYTES
@@ -62,11 +63,15 @@ def a_folder() -> Iterator[Path]:
 
 @contextmanager
 def answering(
-    endpoint: str, voxel_map: VoxelMap, keys: Keys | None = None, moving: MovingSpace | None = None
+    endpoint: str,
+    voxel_map: VoxelMap,
+    keys: Keys | None = None,
+    moving: MovingSpace | None = None,
+    before: MapVisit | None = None,
 ) -> Iterator[QueryService]:
     """A service, fed all the time as a mapper does."""
     stop = threading.Event()
-    with QueryService(endpoint, voxel_map, keys=keys, moving=moving) as service:
+    with QueryService(endpoint, voxel_map, keys=keys, moving=moving, before=before) as service:
 
         def feed() -> None:
             while not stop.wait(0.002):
