@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from semantic_mapper.queries.graph import Door, Floor, Room, SceneGraph
     from semantic_mapper.queries.instances import Instance, OrientedBox
     from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
+    from semantic_mapper.queries.objects import MapObject, ObjectPlace
     from semantic_mapper.queries.occupancy import DistanceField, State
-    from semantic_mapper.queries.questions import Correction, MapInfo, Weights, WeightsEntry
+    from semantic_mapper.queries.questions import Correction, MapInfo, RememberedObjects, Weights, WeightsEntry
     from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
     from semantic_mapper.queries.surface import RayHits
     from semantic_mapper.replay.log.sequence import open_log
@@ -42,15 +43,18 @@ __all__ = [
     "MapClient",
     "MapInfo",
     "MapMirror",
+    "MapObject",
     "MapPoints",
     "MapSnapshot",
     "Mapper",
     "NearestSurface",
+    "ObjectPlace",
     "OccupancyGrid",
     "OrientedBox",
     "PointAnswers",
     "PosedFrame",
     "RayHits",
+    "RememberedObjects",
     "Room",
     "SceneGraph",
     "SemanticMapperError",
@@ -85,8 +89,9 @@ _HOMES = {  # modules below this package, by name; where it is called otherwise 
     **dict.fromkeys(("Door", "Floor", "Room", "SceneGraph"), "queries.graph"),
     **dict.fromkeys(("Instance", "OrientedBox"), "queries.instances"),
     **dict.fromkeys(("NearestSurface", "PointAnswers"), "queries.nearest"),
+    **dict.fromkeys(("MapObject", "ObjectPlace"), "queries.objects"),
     **dict.fromkeys(("DistanceField", "State"), "queries.occupancy"),
-    **dict.fromkeys(("Correction", "MapInfo", "Weights", "WeightsEntry"), "queries.questions"),
+    **dict.fromkeys(("Correction", "MapInfo", "RememberedObjects", "Weights", "WeightsEntry"), "queries.questions"),
     **dict.fromkeys(("MapMirror", "MapSnapshot"), "queries.snapshot"),
     "RayHits": "queries.surface",
     "open_log": "replay.log.sequence",
