@@ -2,7 +2,7 @@
 
 What is moved are the pieces of ``make_room`` (groups of primitives) that a person can carry and on which nothing
 stands. They stay upright and go to a free place on a floor or on a level top, of the same room or of another one. On
-the second day lamps have other strengths and colours, and door leaves other angles.
+the second day lamps have other strengths and colours, and doors stand otherwise where nothing is in the way.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ LEAST_SHIFT_M, NUDGE_M = 0.3, 0.1
 GAP_M = 0.04  # to what stands round a new place
 TOP_M = (0.3, 1.3)  # heights of tops
 SHELL = 6  # groups: floor, ceiling, walls
+SWING = (0.4, 1.4)  # radians that the leaf of a door turns by
 TRIES = 400
 
 Kind = Literal["moved", "nudged", "swapped", "new", "gone"]
@@ -270,8 +271,41 @@ def next_day(home: Home, seed: int, *, changes: bool = True) -> tuple[Home, list
             break
     if changes:
         found += _swap(movers)
-    rooms = tuple(_relit(scene, rng) for scene in movers.rooms)
-    return Home(rooms, home.offsets), found
+    leaves = np.random.default_rng((79, seed))
+    opened = [_swing(scene, leaves) if changes else scene for scene in movers.rooms]
+    return Home(tuple(_relit(scene, rng) for scene in opened), home.offsets), found
+
+
+def _swing(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Turn the leaf of each door to where nothing is in its way, a closed one into the room."""
+    p = scene.primitives
+    center, rotation = p.center.copy(), p.rotation.copy()
+    for k in np.flatnonzero(
+        (p.label == ROOMS.id_of("door")) & (p.half[:, 2] > 0.9) & (p.half[:, :2].max(axis=1) > 0.3)
+    ):
+        wide = int(np.argmax(p.half[k, :2]))
+        own = (p.center - p.center[k]) @ p.rotation[k]
+        reach = p.half[k] + 0.2 * (np.arange(3) == 1 - wide)
+        leaf = np.flatnonzero((p.group == p.group[k]) & (np.abs(own) < reach).all(axis=1))
+        lock = own[leaf, wide][np.abs(own[leaf, wide]).argmax()]  # where the handle is
+        half = p.rotation[k][:2, wide] * np.copysign(p.half[k, wide], lock)
+        hinge, along = p.center[k, :2] - half, np.linspace(0.3, 1.0, 12)[:, None]
+        low, high = p.bounds()
+        solid = (p.group != p.group[k]) & (low[:, 2] < 1.8) & (high[:, 2] > 0.1)
+        most = rng.uniform(*SWING)
+        for sign in rng.permutation((-1.0, 1.0)):
+            angle, step = 0.0, 0.1
+            while angle < most:
+                xy = hinge + along @ (2 * half[None]) @ rotation_z(sign * (angle + step))[:2, :2].T
+                if ((xy[:, None] > low[solid, :2] - GAP_M) & (xy[:, None] < high[solid, :2] + GAP_M)).all(axis=2).any():
+                    break
+                angle += step
+            if angle >= SWING[0]:
+                turn, pivot = rotation_z(sign * angle), np.append(hinge, 0.0)
+                center[leaf] = (p.center[leaf] - pivot) @ turn.T + pivot
+                rotation[leaf] = turn @ p.rotation[leaf]
+                break
+    return replace(scene, primitives=replace(p, center=center, rotation=rotation))
 
 
 def _swap(movers: _Movers) -> list[DayChange]:
