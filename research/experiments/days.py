@@ -29,7 +29,7 @@ from research.suites.config import camera_of_width
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import unproject
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -104,13 +104,14 @@ class _Seen:
         return found
 
 
-class _Labelled:
+class Labelled:
     """A map of true labels, with views as a mapper keeps them."""
 
-    def __init__(self, voxel_map: VoxelMap | None) -> None:
-        self.voxel_map = VoxelMap(VoxelMapConfig(), ROOMS) if voxel_map is None else voxel_map
+    def __init__(self, voxel_map: VoxelMap | None, label_set: LabelSet = ROOMS) -> None:
+        self.voxel_map = VoxelMap(VoxelMapConfig(), label_set) if voxel_map is None else voxel_map
 
     def add(self, frame: PosedFrame) -> None:
+        """Fuse a frame."""
         map_frame(self.voxel_map, frame)
         if self.voxel_map.places.wants(frame.T_world_camera):
             assert frame.depth_m is not None
@@ -142,7 +143,7 @@ def map_days(seed: int, *, changes: bool, own: bool, apart: bool) -> tuple[MapVi
     camera = camera_of_width(OWN_WIDTH if own else WIDTH)
     visits, voxel_map = list[MapVisit](), None
     for day, rooms in enumerate((home, later)):
-        mapper = (_Own if own else _Labelled)(None if apart else voxel_map)
+        mapper = (_Own if own else Labelled)(None if apart else voxel_map)
         views = visit(rooms, seed + 31 * day, FRAMES, camera, NoiseConfig(), errors if day else ())
         for number, (_, view) in enumerate(views):
             seen.look(view, day)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -109,39 +109,9 @@ class ObjectChange:
     probability: float  # that the change is real
 
 
-class _Box(msgspec.Struct, frozen=True, array_like=True):
-    center: tuple[float, float, float]
-    size: tuple[float, float, float]
-    R: tuple[float, float, float, float, float, float, float, float, float]
-
-
-class _Place(msgspec.Struct, frozen=True, array_like=True):
-    stamp_ns: int
-    box: _Box
-    room: int | None
-
-
-class _Row(msgspec.Struct, frozen=True, array_like=True):
-    id: Annotated[int, msgspec.Meta(ge=1)]
-    class_name: str
-    classes: tuple[tuple[int, float], ...]
-    color: Annotated[bytes, msgspec.Meta(min_length=3, max_length=3)]
-    signature: Annotated[bytes, msgspec.Meta(min_length=SIGNATURE, max_length=SIGNATURE)]
-    points: Annotated[bytes, msgspec.Meta(max_length=6 * POINTS)]
-    first_seen_ns: int
-    last_seen_ns: int
-    views: int
-    places: Annotated[tuple[_Place, ...], msgspec.Meta(min_length=1, max_length=MAX_PLACES)]
-    missed: int
-    gone_ns: int | None
-    appeared: bool
-    certainty: float
-    seen: float
-
-
 class _Rows(msgspec.Struct, frozen=True, array_like=True):
     next_id: Annotated[int, msgspec.Meta(ge=1)]
-    objects: Annotated[tuple[_Row, ...], msgspec.Meta(max_length=MAX_OBJECTS)]
+    objects: Annotated[tuple[MapObject, ...], msgspec.Meta(max_length=MAX_OBJECTS)]
 
 
 class ObjectMemory:
@@ -336,8 +306,7 @@ class ObjectMemory:
 
     def to_bytes(self) -> bytes:
         """For a file; see ``from_bytes``."""
-        rows = _Rows(self._next_id, tuple(map(_row_of, self.objects)))
-        content = msgspec.msgpack.encode(rows)
+        content = msgspec.msgpack.encode(_Rows(self._next_id, self.objects), enc_hook=_pack)
         return struct.pack("<I", len(content)) + zstd_compress(content)
 
     @classmethod
@@ -350,10 +319,13 @@ class ObjectMemory:
             if size > MAX_BYTES:
                 raise MapError(f"object memory: {size} bytes, at most {MAX_BYTES} are read")
             content = zstd_decompress(data[4:], size, "object memory")
-            rows = msgspec.msgpack.decode(content, type=_Rows)
-        except (CodecError, struct.error, msgspec.DecodeError, ValueError) as error:
+            rows = msgspec.msgpack.decode(content, type=_Rows, dec_hook=_unpack)
+            whole = all(o.id > 0 and o.classes and o.places and o.signature.shape == (SIGNATURE,) for o in rows.objects)
+        except (CodecError, struct.error, msgspec.DecodeError, ValueError, TypeError) as error:
             raise MapError(f"object memory is damaged: {error}") from error
-        return cls(map(_object_of, rows.objects), rows.next_id)
+        if not whole:
+            raise MapError("object memory is damaged: of an object its id, classes, places or looks are missing")
+        return cls(rows.objects, rows.next_id)
 
     def _forget(self) -> None:
         excess = len(self._objects) - MAX_OBJECTS
@@ -507,59 +479,13 @@ def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mappin
     )
 
 
-def _row_of(thing: MapObject) -> _Row:
-    return _Row(
-        thing.id,
-        thing.class_name,
-        thing.classes,
-        thing.color.tobytes(),
-        thing.signature.tobytes(),
-        thing.points.astype("<i2").tobytes(),
-        thing.first_seen_ns,
-        thing.last_seen_ns,
-        thing.views,
-        tuple(_Place(place.stamp_ns, _box_row(place.box), place.room) for place in thing.places),
-        thing.missed,
-        thing.gone_ns,
-        thing.appeared,
-        thing.certainty,
-        thing.seen,
-    )
+def _pack(value: object) -> object:
+    """An array as its shape and bytes; only little-endian machines run this."""
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"no file holds a {type(value).__name__}")
+    return value.shape, value.tobytes()
 
 
-def _object_of(row: _Row) -> MapObject:
-    if len(row.points) % 6 or not row.classes:
-        raise MapError(f"object memory is damaged: object {row.id} has {len(row.points)} bytes of points, or no class")
-    places = tuple(ObjectPlace(place.stamp_ns, _box_of(place.box), place.room) for place in row.places)
-    return MapObject(
-        id=row.id,
-        class_id=row.classes[0][0],
-        class_name=row.class_name,
-        classes=row.classes,
-        box=places[-1].box,
-        color=np.frombuffer(row.color, np.uint8),
-        signature=np.frombuffer(row.signature, np.int8),
-        points=np.frombuffer(row.points, "<i2").reshape(-1, 3).astype(np.int16),
-        first_seen_ns=row.first_seen_ns,
-        last_seen_ns=row.last_seen_ns,
-        views=row.views,
-        room=places[-1].room,
-        places=places,
-        missed=row.missed,
-        gone_ns=row.gone_ns,
-        appeared=row.appeared,
-        certainty=row.certainty,
-        seen=row.seen,
-    )
-
-
-def _box_row(box: OrientedBox) -> _Box:
-    center, size, R = (
-        tuple(np.asarray(v, np.float64).ravel().tolist()) for v in (box.center, box.size, box.R_world_box)
-    )
-    values: Any = center, size, R
-    return _Box(*values)
-
-
-def _box_of(row: _Box) -> OrientedBox:
-    return OrientedBox(np.array(row.center), np.array(row.size), np.array(row.R).reshape(3, 3))
+def _unpack(annotation: Any, value: Any) -> NDArray[np.generic]:
+    shape, data = value
+    return np.frombuffer(data, get_args(get_args(annotation)[1])[0]).reshape(shape).copy()
