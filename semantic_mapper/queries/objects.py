@@ -208,7 +208,10 @@ class ObjectMemory:
                 left.add(thing.id)
             elif thing.id not in left and missed[i]:
                 self._objects[thing.id] = replace(thing, missed=thing.missed + missed[i])
+        there = [o.surface for o in old if o.id in left]
         for part in taken:
+            if len(touching([part.surface, *there])) <= len(there):  # a part of what left
+                continue
             thing = self._with_id(part)
             self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=1)
         for i, j in same:
@@ -232,8 +235,8 @@ class ObjectMemory:
             T = partial(fit.at, thing.box.center)
             evidence[i] = find_evidence(now, thing.surface, lambda T=T, o=thing: transform(T(), o.surface))
         left = [i for i, e in evidence.items() if old[i].class_name not in FIXTURES and e.free_of >= SHIFTED_FREE]
-        whole = [i for i in left if evidence[i].free_of >= GONE_FREE and old[i].class_name == OTHER]
-        for group in touching([old[i].surface for i in whole]):
+        whole = [i for i in left if evidence[i].free_of >= GONE_FREE]
+        for group in touching([old[i].surface for i in whole], [old[i].class_id for i in whole]):
             for i in sorted((whole[k] for k in group), key=lambda i: -float(np.prod(old[i].box.size)))[1:]:
                 left.remove(i)
                 del self._objects[old[i].id]
@@ -342,7 +345,7 @@ def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:
     """Small things of which pieces came together as one each, and how much of the place of each was free."""
     whole = [j for j, f in enumerate(free) if f >= GONE_FREE]
     points = [sample_points(now.things[j], now.snapshot) for j in whole]
-    groups = [[whole[k] for k in g] for g in touching(points) if len(g) > 1]
+    groups = [[whole[k] for k in g] for g in touching(points, [now.things[j].class_id for j in whole]) if len(g) > 1]
     gone = {j for group in groups for j in group}
     kept = [j for j in range(len(free)) if j not in gone]
     ones = [joined([now.things[j] for j in group], now.snapshot.voxel_size_m) for group in groups]

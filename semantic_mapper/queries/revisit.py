@@ -38,9 +38,9 @@ LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are called whether they see through it
 LEAST_LOOKS = 2
-TOUCH_M = 0.04  # small pieces that came, or left, together and are so near to each other are one thing
+TOUCH_M = 0.07  # small pieces that came, or left, together and are so near to each other are one thing
 BEHIND_M = 0.1  # a view sees through a point where it meets the surface so far behind it
-REACH_M, PAST_M = 5.0, 1.5  # of a view, and how far past a point it is followed
+REACH_M, PAST_M = 5.0, 4.0  # of a view, and how far past a point it is followed
 CELL_M, CELL_REACH_M = 2.0, 1.8  # surfaces are fitted in cells of this size, by what is so near to their middle
 FIT_POINTS, LEAST_FIT, FIT_ROUNDS = 3000, 300, 8
 FIT_TUKEY = 2.5  # voxels
@@ -95,7 +95,7 @@ class Looks:
             ray = points[seen] - c[view]
             length = np.linalg.norm(ray, axis=1)
             hit = cast_rays(snapshot, c[view], ray, float(length.max()) + PAST_M).distance_m
-            sees = hit > length + BEHIND_M
+            sees = (hit > length + BEHIND_M) & (hit < length + PAST_M)  # past that, it is not known how far it saw
             free[seen] += sees
             through += int(2 * sees.sum() > len(seen))
         return free, through
@@ -299,12 +299,17 @@ def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
     return replace(thing, voxels=thing.voxels[rows], box=box, centroid=xyz[rows].mean(axis=0))
 
 
-def touching(points: Sequence[Float64]) -> list[list[int]]:
-    """Groups of pieces, of points (N, 3), whose boxes touch."""
+def touching(points: Sequence[Float64], classes: Sequence[int] = ()) -> list[list[int]]:
+    """Groups of pieces, of points (N, 3), whose boxes touch; of one class, where classes are given."""
     ends = [(p.min(axis=0) - TOUCH_M, p.max(axis=0)) for p in points]
     groups: list[list[int]] = []
-    for k, (low, high) in enumerate(ends):
-        near = [g for g in groups if any((ends[m][0] <= high).all() and (low <= ends[m][1]).all() for m in g)]
+
+    def touch(k: int, m: int) -> bool:
+        same = not classes or classes[k] == classes[m]
+        return same and bool((ends[m][0] <= ends[k][1]).all() and (ends[k][0] <= ends[m][1]).all())
+
+    for k in range(len(points)):
+        near = [g for g in groups if any(touch(k, m) for m in g)]
         groups = [g for g in groups if g not in near] + [[*(m for g in near for m in g), k]]
     return groups
 
