@@ -20,10 +20,11 @@ from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
-from semantic_mapper.queries.instances import OTHER, OrientedBox
+from semantic_mapper.queries.instances import OrientedBox
 from semantic_mapper.queries.revisit import (
     FIXTURES,
     GONE_FREE,
+    LEAST_VOXELS,
     SHIFTED_FREE,
     SIGNATURE,
     Candidate,
@@ -92,6 +93,12 @@ class MapObject:
     def surface(self) -> Float64:
         """(N, 3) float64 points of its surface, world metres."""
         return self.box.center + self.points / 1000.0
+
+    @property
+    def present(self) -> float:
+        """Probability that it is still there: of what has gone, that this is wrong; else each view of its place since
+        without it counts as much as the one that saw it. Time alone changes nothing."""
+        return 1 / (1 + self.missed) if self.gone_ns is None else 1 - self.certainty
 
     @property
     def probability(self) -> float:
@@ -232,6 +239,8 @@ class ObjectMemory:
         Small things that left as several pieces are one object from now on: that of the largest."""
         evidence = dict[int, Evidence]()
         for i, thing in enumerate(old):
+            if len(thing.points) < LEAST_VOXELS:
+                continue
             T = partial(fit.at, thing.box.center)
             evidence[i] = find_evidence(now, thing.surface, lambda T=T, o=thing: transform(T(), o.surface))
         left = [i for i, e in evidence.items() if old[i].class_name not in FIXTURES and e.free_of >= SHIFTED_FREE]
@@ -253,7 +262,7 @@ class ObjectMemory:
         free = list[float]()
         for thing in now.things:
             points = sample_points(thing, now.snapshot)
-            if before is None or thing.class_name in FIXTURES:
+            if before is None or thing.class_name in FIXTURES or len(thing.voxels) < LEAST_VOXELS:
                 free.append(0.0 if before is not None else 1.0)
                 continue
             T = partial(fit.at, points.mean(axis=0))

@@ -35,6 +35,7 @@ GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is f
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
 LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
+LEAST_VOXELS = 40  # of a thing that may have left or come: less is often noise
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are called whether they see through it
 LEAST_LOOKS = 2

@@ -26,7 +26,7 @@ from semantic_mapper.queries.objects import (
     remember,
     visit_of,
 )
-from semantic_mapper.queries.revisit import Looks, MapVisit
+from semantic_mapper.queries.revisit import Looks, MapVisit, touching
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -74,6 +74,7 @@ def test_what_was_moved_came_and_went_is_told_apart() -> None:
     assert (then.stamp_ns, now.stamp_ns, chest.first_seen_ns, chest.last_seen_ns) == (10, 20, 10, 20)
     assert (bench.gone_ns, bench.last_seen_ns, desk.first_seen_ns, desk.appeared) == (20, 10, 20, True)
     assert chest.id < desk.id and bench.missed >= 1 and chest.missed == 0
+    assert bench.present < 0.4 and chest.present == 1 and replace(chest, missed=3).present == 0.25
     (table,) = [o for o in memory.there if np.linalg.norm(o.box.center - TABLE) < 0.1]
     assert table.views == 2 and len(table.places) == 1 and memory.get(table.id) is table
 
@@ -85,6 +86,13 @@ def test_what_was_brought_back_is_what_was_taken_away() -> None:
     memory.update(visit([*two_rooms(), box(BENCH, 1.4, 0.4)], 30), UP, before=visit(two_rooms(), 20))
     (change,) = changes_of(memory.objects, 20)
     assert (change.kind, change.object.id, change.object.gone_ns) == ("moved", bench.id, None)
+
+
+def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 0.1, 3)] * 3), axis=-1).reshape(-1, 3)
+    seat, leg, other, far = (grid + (x, 0, 0) for x in (0.0, 0.16, 0.32, 0.6))
+    assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
+    assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
 
 
 def test_nothing_has_gone_that_could_not_be_seen() -> None:
