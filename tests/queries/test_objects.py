@@ -90,7 +90,7 @@ def test_what_was_brought_back_is_what_was_taken_away() -> None:
 
 def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
     grid = np.stack(np.meshgrid(*[np.linspace(0, 0.1, 3)] * 3), axis=-1).reshape(-1, 3)
-    seat, leg, other, far = (grid + (x, 0, 0) for x in (0.0, 0.16, 0.32, 0.6))
+    seat, leg, other, far = (grid + np.array((x, 0, 0)) for x in (0.0, 0.16, 0.32, 0.6))
     assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
     assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
 
