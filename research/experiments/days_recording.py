@@ -1,6 +1,6 @@
 """A recording cut into two visits, with a thing taken out of the second: it has gone, and nothing else has changed.
 
-    python -m research.experiments.days_recording path/to/redkitchen --things 3 12 54 56 65 66
+    python -m research.experiments.days_recording path/to/redkitchen --things 3 12 65 66
 
 The folder has ``label``, ``instance`` and ``mesh_labels.npz`` (``vertices``, ``faces``, ``label``, ``instance``,
 ``T_gravity``). Where a frame of the second visit shows the thing, or a pixel beside it, it gets the depth and the class
@@ -95,7 +95,7 @@ def main() -> None:
     """Print what is reported for each thing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--things", type=int, nargs="+", default=[3, 12, 54, 56, 65, 66])
+    parser.add_argument("--things", type=int, nargs="+", default=[3, 12, 65, 66])
     arguments = parser.parse_args()
     room = Room(arguments.folder)
     before = room.visit(0)
