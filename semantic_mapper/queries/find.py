@@ -1,0 +1,278 @@
+"""The remembered objects that a phrase means, the likeliest first, and where to look at each from.
+
+The probability of an answer is the product of those of its parts, as if they were independent: its class, each colour,
+size, room and relation (softened: there is no sharp end of red or near), and that it is still there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from semantic_mapper.geometry import look_at
+from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.queries.checks import check_up
+from semantic_mapper.queries.objects import MapObject
+from semantic_mapper.queries.occupancy import State, read_states
+from semantic_mapper.queries.phrase import COLORS, ROOM_KINDS, NounPhrase, read_phrase
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import cast_rays, points_in_box, up_in
+from semantic_mapper.queries.text_encoder import TextEncoder
+from semantic_mapper.types import Float64, UInt8
+
+LEAST_PROBABILITY = 0.005  # of an answer
+COLOR_LIGHTNESS, COLOR_SPREAD = 0.5, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
+SIZE_SPREAD, SHADE_SPREAD = 0.12, 8.0  # logarithm of a ratio of lengths; CIELAB lightness
+NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
+ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
+TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
+ROOM_OF_NO_KIND = 1.0  # weight of evidence, against those of ``ROOM_KINDS``
+LOOK_M, EYE_M = (0.5, 2.5), 1.2  # from a thing; height of a camera over the floor
+RADIUS_M, BODY_M, FLOORS = 0.25, (0.15, 1.5, 0.1), {"floor", "floormat"}  # of a robot; heights that it takes, step
+VIEW_DIRECTIONS, VIEW_DISTANCES, VIEW_RAYS, LEAST_VISIBLE = 24, 5, 32, 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundObject:
+    """An answer to a phrase."""
+
+    object: MapObject
+    probability: float  # that it is meant, and still there
+    parts: Mapping[str, float]  # of which that is the product, by the words or by what they are about
+    room_kind: str | None  # likeliest kind of its room, by what stands there; None = of no kind
+    T_world_camera: Float64 | None  # (4, 4) from where it is seen, over free floor; None = no such place is known
+
+
+def find(
+    text: str,
+    snapshot: MapSnapshot,
+    objects: Sequence[MapObject],
+    *,
+    up: ArrayLike | None = None,
+    limit: int = 5,
+    encoder: TextEncoder | None = None,
+) -> tuple[FoundObject, ...]:
+    """The objects of a map that a phrase means, at most ``limit``, the likeliest first; see ``queries.phrase``.
+
+    The day of times without a date is that of the last object seen. ``up``, (3,) in the world, is by default found by
+    the floor. Raises MapError: as of ``read_phrase``, or nobody knows which way is up."""
+    axis = up_in(snapshot) if up is None else check_up(up)
+    now_ns = max((o.last_seen_ns for o in objects), default=0)
+    phrase = read_phrase(text, snapshot.label_set, now_ns, encoder)
+    scene = _Scene(snapshot, objects, axis)
+    found = list[tuple[float, int, dict[str, float]]]()
+    for n, thing in enumerate(objects):
+        parts = scene.looks(thing, phrase.thing)
+        for room in phrase.rooms:
+            parts[f"room {room}" if isinstance(room, int) else room] = scene.in_room(thing, room)
+        if not (phrase.after_ns or 0) <= thing.last_seen_ns < (phrase.before_ns or 2**63):
+            continue
+        parts["there"] = 1 - thing.certainty if thing.gone_ns else (1 + thing.views) / (1 + thing.views + thing.missed)
+        if (probability := float(np.prod(list(parts.values())))) >= LEAST_PROBABILITY:
+            found.append((probability, n, parts))
+    for relation, noun in phrase.relations:
+        found = [(p * r, n, parts | {f"{relation} {noun.text}": r}) for p, n, parts in found
+                 if p * (r := scene.related(objects[n], relation, noun)) >= LEAST_PROBABILITY]  # fmt: skip
+    best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[:limit]
+    return tuple(
+        FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
+        for p, n, parts in best
+    )
+
+
+class _Scene:
+    """What is needed of all objects to judge one."""
+
+    def __init__(self, snapshot: MapSnapshot, objects: Sequence[MapObject], up: Float64) -> None:
+        self._snapshot, self._up = snapshot, up
+        self._there = [o for o in objects if o.gone_ns is None]
+        self._kinds = room_kinds(self._there)
+        sizes = {n: [_sizes(o) for o in self._there if o.class_id == n] for n in {o.class_id for o in self._there}}
+        self._medians = {n: np.median(rows, axis=0) for n, rows in sizes.items() if len(rows) > 1}
+        labels = snapshot.label_set
+        self._stuff = {n for n, name in zip(labels.ids, labels.names, strict=True) if name in STUFF_NAMES}
+
+    def looks(self, thing: MapObject, noun: NounPhrase) -> dict[str, float]:
+        """How well its class, colour and size fit."""
+        parts = {"class": sum(p * noun.classes.get(n, 0.0) for n, p in thing.classes)}
+        if noun.colors or noun.shade:
+            lab = _lab(thing.color)
+            if noun.colors:
+                names = color_names(lab)
+                parts["color"] = max(names[name] for name in noun.colors)
+            if noun.shade:
+                parts["shade"] = _soft(noun.shade * (lab[0] - 50) / SHADE_SPREAD)
+        for what, sign in noun.sizes:
+            median = self._medians.get(thing.class_id)
+            k = ("size", "height", "length").index(what)
+            parts[what] = 0.5 if median is None else _soft(sign * (_sizes(thing)[k] - median[k]) / SIZE_SPREAD)
+        return parts
+
+    def kind(self, room: int | None) -> str | None:
+        """Likeliest kind of a room."""
+        kinds = self._kinds.get(room or 0, {})
+        best = max(kinds, key=lambda name: kinds[name], default="")
+        return best or None
+
+    def in_room(self, thing: MapObject, room: int | str) -> float:
+        if isinstance(room, int):
+            return float(thing.room == room)
+        return self._kinds.get(thing.room or 0, {}).get(room, 0.0)
+
+    def related(self, thing: MapObject, relation: str, noun: NounPhrase) -> float:
+        """How well a thing stands in a relation to any other that fits a noun."""
+        best = self._touches(thing, relation, noun)
+        for other in self._there:
+            reach = np.linalg.norm(thing.box.size) / 2 + np.linalg.norm(other.box.size) / 2 + 2 * NEAR_M
+            if other.id == thing.id or np.linalg.norm(thing.box.center - other.box.center) > reach:
+                continue
+            fits = float(np.prod(list(self.looks(other, noun).values())))
+            if fits > best:
+                best = max(best, fits * self._relation(thing, other, relation))
+        return best
+
+    def _relation(self, thing: MapObject, other: MapObject, relation: str) -> float:
+        up, surface = self._up, thing.surface
+        (low, high), (other_low, other_high) = (
+            (float(o.box.center @ up - o.box.size[2] / 2), float(o.box.center @ up + o.box.size[2] / 2))
+            for o in (thing, other)
+        )
+        offset = _outside(other, thing.box.center[None])[0]
+        aside = float(np.linalg.norm(offset - (offset @ up) * up))  # of its middle, from the other's outline
+        match relation:
+            case "near":
+                return _soft((NEAR_M - np.linalg.norm(_outside(other, surface), axis=1).min()) / NEAR_SPREAD_M)
+            case "on":
+                points = other.surface
+                level = (points - thing.box.center) @ (np.eye(3) - np.outer(up, up))
+                heights = points[np.linalg.norm(level, axis=1) < np.linalg.norm(thing.box.size[:2]) / 2 + 0.1] @ up
+                held = heights[heights < low + 2 * ON_M]
+                top = float(held.max()) if len(held) else other_high
+                over = low > other_low + ON_M
+                return over * float(np.exp(-(((low - top) / ON_M) ** 2) / 2)) * _soft(2 - aside / FOOTPRINT_M)
+            case "under":
+                return _soft((other_high - high) / FOOTPRINT_M) * _soft(2 - aside / FOOTPRINT_M)
+            case "above":
+                return _soft((low - other_high) / FOOTPRINT_M + 2) * _soft((ABOVE_M - aside) / FOOTPRINT_M)
+            case _:  # in
+                return _soft(2 - float(np.linalg.norm(offset)) / (FOOTPRINT_M / 2))
+
+    def _touches(self, thing: MapObject, relation: str, noun: NounPhrase) -> float:
+        """Of what is no object, such as walls and the floor."""
+        wanted = [n for n in noun.classes if n in self._stuff]
+        if not wanted or relation not in ("on", "near") or not self._snapshot.block_count:
+            return 0.0
+        limit, spread = (TOUCH_M, TOUCH_SPREAD_M) if relation == "on" else (NEAR_M, NEAR_SPREAD_M)
+        xyz, reach = thing.surface, limit + 3 * spread
+        names = {self._snapshot.label_set.names[self._snapshot.label_set.ids.index(n)] for n in wanted}
+        if names <= FLOORS:  # what hangs low at a wall is not on the floor
+            xyz = xyz[xyz @ self._up <= (xyz @ self._up).min() + TOUCH_M]
+        points = points_in_box(self._snapshot, xyz.min(axis=0) - reach, xyz.max(axis=0) + reach)
+        near = points.xyz[np.isin(points.label, wanted)].astype(np.float64)
+        if not len(near):
+            return 0.0
+        near = near[:: 1 + len(near) // 4000]
+        squares = (xyz**2).sum(axis=1)[:, None] + (near**2).sum(axis=1) - 2 * xyz @ near.T
+        return _soft((limit - float(np.sqrt(max(squares.min(), 0)))) / spread)
+
+
+def room_kinds(objects: Sequence[MapObject]) -> dict[int, dict[str, float]]:
+    """Probabilities of the kinds of rooms, by id of the room; "" = none of them."""
+    rooms = dict[int, dict[str, float]]()
+    for thing in objects:
+        if thing.room is not None:
+            there = rooms.setdefault(thing.room, {})
+            there[thing.class_name] = max(there.get(thing.class_name, 0.0), thing.probability)
+    found = dict[int, dict[str, float]]()
+    for room, there in rooms.items():
+        odds = {k: sum(w * there.get(n, 0.0) for n, w in names.items()) for k, names in ROOM_KINDS.items()}
+        odds[""] = ROOM_OF_NO_KIND
+        total = sum(np.exp(v) for v in odds.values())
+        found[room] = {name: float(np.exp(v) / total) for name, v in odds.items()}
+    return found
+
+
+def color_names(lab: Float64) -> dict[str, float]:
+    """Probability of each name of ``COLORS`` for a colour (3,) in CIELAB."""
+    scale = np.array((COLOR_LIGHTNESS, 1, 1)) / COLOR_SPREAD
+    distance = {name: (((_COLORS[name] - lab) * scale) ** 2).sum(axis=1).min() for name in COLORS}
+    odds = {name: float(np.exp(-(d - min(distance.values())) / 2)) for name, d in distance.items()}
+    return {name: value / sum(odds.values()) for name, value in odds.items()}
+
+
+def _lab(rgb: UInt8) -> Float64:
+    """CIELAB (..., 3) of sRGB (..., 3)."""
+    pixels = rgb.reshape(1, -1, 3).astype(np.float32) / np.float32(255)
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(rgb.shape).astype(np.float64)
+
+
+_COLORS = {n: _lab(np.array([[*bytes.fromhex(c)] for c in codes.split()], np.uint8)) for n, codes in COLORS.items()}
+
+
+def _sizes(thing: MapObject) -> Float64:
+    """Logarithms of its diagonal, height and longest level side."""
+    size = np.maximum(thing.box.size, 0.01)
+    return np.log((np.linalg.norm(size), size[2], max(size[:2])))
+
+
+def _outside(thing: MapObject, points: Float64) -> Float64:
+    """From the box of a thing to points (N, 3): vectors (N, 3) in the world, 0 inside."""
+    own = (points - thing.box.center) @ thing.box.R_world_box
+    half = thing.box.size / 2
+    return (own - np.clip(own, -half, half)) @ thing.box.R_world_box.T
+
+
+def _soft(x: float | np.floating) -> float:
+    return float(1 / (1 + np.exp(-np.clip(x, -30, 30))))
+
+
+def view_of(snapshot: MapSnapshot, thing: MapObject, up: Float64) -> Float64 | None:
+    """Pose (4, 4) of a camera over floor that was seen, with room for a robot round it, from where most of a thing is
+    seen; None where no such place is known."""
+    R, size = thing.box.R_world_box, thing.box.size
+    angle = np.linspace(0, 2 * np.pi, VIEW_DIRECTIONS, endpoint=False)[:, None]
+    apart = np.linspace(*LOOK_M, VIEW_DISTANCES) + np.linalg.norm(size[:2]) / 2
+    level = (np.cos(angle) * R[:, 0] + np.sin(angle) * R[:, 1])[:, None] * apart[:, None]
+    start = (thing.box.center + level).reshape(-1, 3) + (EYE_M - size[2] / 2) * up
+    down = cast_rays(snapshot, start, -up, 2 * EYE_M + 2)
+    names = dict(zip(snapshot.label_set.ids, snapshot.label_set.names, strict=True))
+    floor = np.isin(down.label, [n for n, name in names.items() if name in FLOORS]) & (down.distance_m > 0)
+    foot = (start - down.distance_m[:, None] * up)[floor]
+    rim = RADIUS_M * (np.cos(angle) * R[:, 0] + np.sin(angle) * R[:, 1])
+    body = (rim[::2, None] + np.arange(*BODY_M)[:, None] * up).reshape(-1, 3)
+    states = read_states((foot[:, None] + body).reshape(-1, 3) / snapshot.voxel_size_m, snapshot)
+    eyes = foot[(states.reshape(len(foot), -1) < State.OCCUPIED).all(axis=1)] + EYE_M * up
+    if not len(eyes):
+        return None
+    surface = thing.surface[:: 1 + len(thing.points) // VIEW_RAYS]
+    rays = surface - eyes[:, None]  # (E, S, 3)
+    length = np.linalg.norm(rays, axis=-1)
+    origins = np.repeat(eyes, len(surface), axis=0)
+    hit = cast_rays(snapshot, origins, rays.reshape(-1, 3), float(length.max()) + 0.5).distance_m.reshape(length.shape)
+    visible = (np.abs(hit - length) < 3 * snapshot.voxel_size_m).mean(axis=1)
+    best = int((visible - 0.1 * np.abs(length.mean(axis=1) - sum(LOOK_M) / 2)).argmax())
+    return look_at(eyes[best], thing.box.center, up) if visible[best] >= LEAST_VISIBLE else None
+
+
+def render(snapshot: MapSnapshot, T_world_camera: Float64, width: int = 320, fov_rad: float = 1.2) -> UInt8:
+    """What a camera would see of a map: (3/4 width, width, 3) uint8, light grey where nothing is mapped."""
+    height = width * 3 // 4
+    v, u = np.indices((height, width), np.float64)
+    focal = width / 2 / np.tan(fov_rad / 2)
+    rays = np.stack(((u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones_like(u)), axis=-1)
+    hits = cast_rays(snapshot, T_world_camera[:3, 3], rays.reshape(-1, 3) @ T_world_camera[:3, :3].T)
+    return np.where(hits.distance_m[:, None] > 0, hits.rgb, np.uint8(230)).reshape(height, width, 3)
+
+
+def picture_of(snapshot: MapSnapshot, found: FoundObject, up: Float64, width: int = 320) -> UInt8:
+    """A crop (H, W, 3) uint8 round an object, seen from where ``found`` says, or from above its side."""
+    box = found.object.box
+    size = float(np.linalg.norm(box.size))
+    T = found.T_world_camera
+    if T is None:
+        T = look_at(box.center + (size + 0.5) * (box.R_world_box[:, 1] + 0.7 * up), box.center, up)
+    distance = float(np.linalg.norm(T[:3, 3] - box.center))
+    return render(snapshot, T, width, 2 * float(np.arctan(0.8 * size / distance)))
