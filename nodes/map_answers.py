@@ -7,6 +7,7 @@ import numpy as np
 
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import scale_name
+from semantic_mapper.queries.find import FoundObject
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
@@ -106,6 +107,27 @@ def answer_changes(since_ns: int, changes: Sequence[ObjectChange]) -> dict[str, 
             for change in changes
         ],
     }
+
+
+def answer_find(phrase: str, answers: Sequence[FoundObject]) -> dict[str, Any]:
+    """The objects that a phrase means, the likeliest first."""
+    found = [
+        {
+            "id": answer.object.id,
+            "class": answer.object.class_name,
+            "probability": round(answer.probability, DIGITS),
+            "parts": {name: round(value, DIGITS) for name, value in answer.parts.items()},
+            "room": answer.object.room,
+            "room_kind": answer.room_kind,
+            "box": _describe_box(answer.object.box),
+            "last_seen_ns": answer.object.last_seen_ns,
+            "gone_ns": answer.object.gone_ns,
+            "T_world_camera": None if answer.T_world_camera is None else np.round(answer.T_world_camera, 6).tolist(),
+            "picture": None,
+        }
+        for answer in answers
+    ]
+    return {"question": "find", "phrase": phrase, "answers": found}
 
 
 def _describe_place(place: ObjectPlace) -> dict[str, Any]:

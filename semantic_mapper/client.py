@@ -15,13 +15,15 @@ from semantic_mapper.mapping.floor_plan import Band, OccupancyGrid
 from semantic_mapper.mapping.map_types import CameraPose, CorrectedPoses, MapPoints
 from semantic_mapper.queries import questions
 from semantic_mapper.queries.checks import as_numbers
+from semantic_mapper.queries.find import FoundObject, find
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.questions import AnswerT, Correction, MapInfo, Point, RememberedObjects, Request, Weights
-from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import RayHits, costmap
+from semantic_mapper.queries.text_encoder import TextEncoder
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import server_identity
 from semantic_mapper.transport.launches import LIVE, MapperAddress, find_mapper
@@ -124,16 +126,30 @@ class MapClient(Closing):
         Computed here, from ``mirror``; the things are those of ``instances``. Ids of rooms stay from call to call of
         this client, for each ``up`` ((3,), by default found by the floor); those of another client may differ.
         """
+        snapshot, tracker = self._tracked(up)
+        return tracker.update(snapshot, self.instances(tracker.up_in(snapshot)))
+
+    def _tracked(self, up: ArrayLike | None) -> tuple[MapSnapshot, GraphTracker]:
+        """The mirror's present state, and what knows its graph for this ``up``."""
         snapshot = self.mirror().snapshot()
         with self._mirror_lock:
             key = (self._mirrored, None if up is None else _point(up, "up"))
-            tracker = self._graphs.setdefault(key, GraphTracker(up))
-        return tracker.update(snapshot, self.instances(tracker.up_in(snapshot)))
+            return snapshot, self._graphs.setdefault(key, GraphTracker(up))
 
     def objects(self, up: ArrayLike | None = None) -> RememberedObjects:
         """What the map remembers of its things: their places, when they were seen, and those that have gone; brought up
         to the present first. ``up`` (3,) is by default found by the floor. See ``queries.objects``."""
         return self._ask(questions.ObjectsRequest(up=None if up is None else _point(up, "up")))
+
+    def find(
+        self, phrase: str, *, limit: int = 5, up: ArrayLike | None = None, encoder: TextEncoder | None = None
+    ) -> tuple[FoundObject, ...]:
+        """The objects that a phrase means ("red chair near the table"), the likeliest first, with a pose to look at each
+        from; computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of the
+        synonyms. See ``queries.find``."""
+        objects = self.objects(up).objects
+        snapshot, tracker = self._tracked(up)
+        return find(phrase, snapshot, objects, up=tracker.up_in(snapshot), limit=limit, encoder=encoder)
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""

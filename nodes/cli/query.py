@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,24 +36,26 @@ from semantic_mapper.nodes.cli.verb import (
 from semantic_mapper.nodes.console import Output, frame_progress, table
 from semantic_mapper.plain_text import counted
 from semantic_mapper.plots import write_picture
+from semantic_mapper.queries.find import find, open_objects, picture_of
 from semantic_mapper.queries.graph import GraphTracker, draw_graph
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, at, nearest
 from semantic_mapper.queries.objects import changes_between, changes_of
+from semantic_mapper.queries.phrase import has_date
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
-from semantic_mapper.replay.run_folder import map_path, prepare_file
+from semantic_mapper.replay.run_folder import map_path, prepare_file, prepare_folder
 from semantic_mapper.transport.launches import is_running_mapper, launch_folder, running_launches
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 _log = get_logger(__name__)
 Up = tuple[float, float, float]
 Things = tuple[Instance, ...]
-Question = Literal["info", "at", "nearest", "instances", "graph", "changes", "relocalize"]
-ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "relocalize": "LOG"}
+Question = Literal["info", "at", "nearest", "instances", "graph", "changes", "find", "relocalize"]
+ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "find": "PHRASE", "relocalize": "LOG"}
 
 
 def _classes(ctx: typer.Context, incomplete: str) -> list[str]:
@@ -79,7 +82,7 @@ def query(
     question: Question,
     remote: Remote,
     arguments: Annotated[
-        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [LOG]", autocompletion=_classes)
+        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [PHRASE] [LOG]", autocompletion=_classes)
     ] = None,
     *,
     up: UpOption = "auto",
@@ -88,6 +91,7 @@ def query(
     unsure: bool = False,  # nearest, instances: also below the least certainty
     picture: Path | None = None,  # graph: also draw it from above (.png)
     since: Path | None = None,  # changes: map of before; of a running mapper, the one that it goes on in
+    pictures: Path | None = None,  # find: folder for a picture of each answer
     every: AtLeastOne = 1,  # relocalize: every n-th frame
 ) -> int:
     """Ask a saved map, or a running mapper, what is where.
@@ -95,13 +99,15 @@ def query(
     info: size and classes. at X Y Z: class at a point, whose box it is in, and whether it is free, occupied or
     unknown. nearest CLASS X Y Z: the nearest surface of a class, and its thing. instances: countable things with
     upright boxes, certainty and the fraction seen. graph: floors, rooms, doors, and things by room. changes: what was
-    moved, is new or has gone since another map. relocalize LOG: find frames with measured depth in a saved map; exit
-    code 1 where they do not agree.
+    moved, is new or has gone since another map. find PHRASE: remembered things by class or synonym, colour, size, room
+    (`in room 2`, `in the kitchen`: by what stands there), relation (near, on, under, above, in) and time. relocalize
+    LOG: find frames with measured depth in a saved map; exit code 1 where they do not agree.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
     Example: semantic-mapper query runs/demo graph --picture rooms.png
     Example: semantic-mapper query runs/today changes --since runs/yesterday
+    Example: semantic-mapper query live find "red chair near the table, last seen before noon" --pictures found
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     name, point = _read_arguments(question, arguments or [])
@@ -113,15 +119,21 @@ def query(
         (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
         (picture is not None and question != "graph", "--picture", "goes with `graph`"),
+        (pictures is not None and question != "find", "--pictures", "goes with `find`"),
         (since is not None and (live or question != "changes"), "--since", "goes with `changes` of a saved map"),
     )
     if picture is not None:
         prepare_file(picture)
+    if pictures is not None:
+        prepare_folder(pictures)
     code = 0
     if question == "relocalize":
         found = _relocalize(output, source, Path(name), every, live=live)
         located = [session["T_map_world"] is not None for session in found["sessions"]]
         code = 0 if located and all(located) else EXIT_FAILED
+    elif question == "find":
+        found = {"map": source, **_find(source, name, axis, pictures, remote, live=live)}
+        output.print(answer_table(found))
     elif question == "changes" and not live:
         found = {"map": source, **_saved_changes(source, since)}
         output.print(answer_table(found))
@@ -204,6 +216,26 @@ def _saved_changes(source: str, since: Path | None) -> dict[str, Any]:
     return map_answers.answer_changes(before.last_stamp_ns, changes_between(now, before))
 
 
+def _find(
+    source: str, phrase: str, up: Up | None, pictures: Path | None, remote: Remote, *, live: bool
+) -> dict[str, Any]:
+    """What a phrase means, in a saved map or that of a running mapper, with a picture of each answer."""
+    if live:
+        with MapClient(source, server=remote.server, keys=remote.keys) as client:
+            answers, snapshot = client.find(phrase, up=up), client.mirror().snapshot()
+    else:
+        must_be_there(Path(source))
+        snapshot, objects = open_objects(map_path(Path(source)))
+        answers = find(phrase, snapshot, objects, up=up)
+    found = map_answers.answer_find(phrase, answers)
+    for number, answer in enumerate(answers if pictures is not None else (), start=1):
+        assert pictures is not None
+        path = pictures / f"{number}_{answer.object.class_name}_{answer.object.id}.png"
+        write_picture(path, picture_of(snapshot, answer, np.array(up or up_in(snapshot))))
+        found["answers"][number - 1]["picture"] = str(path)
+    return found
+
+
 def _axis(world_map: MapClient | MapSnapshot, up: Up | None) -> Up:
     """As given; else of a saved map away from the floor, as in the graph; else z of the world."""
     if up is not None or not isinstance(world_map, MapSnapshot):
@@ -224,6 +256,8 @@ def _instances(world_map: MapClient | MapSnapshot, up: Up, gone: bool = False, u
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
     """Class name or file, and point, as far as the question has them."""
     expected = ARGUMENTS.get(question, "").split()
+    if question == "find" and arguments:
+        return " ".join(arguments), ()
     if len(arguments) != len(expected):
         raise typer.BadParameter(
             f"`{question}` takes {' '.join(expected) or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
@@ -274,6 +308,8 @@ def answer_table(found: dict[str, Any]) -> Table:
         return _graph_table(found)
     if found["question"] == "changes":
         return _change_table(found)
+    if found["question"] == "find":
+        return _find_table(found)
     unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
     plain = {key: value for key, value in found.items() if not isinstance(value, dict)} | _in_words(found)
     plain |= {key: f"{_joined(value)} {unit}" for key, value in plain.items() if isinstance(value, list)}
@@ -343,6 +379,23 @@ def _change_table(found: dict[str, Any]) -> Table:
     ]
     names = ("", "id", "class", "probability", "room before", "center before, m", "room", "center, m")
     return table(rows, names, title=found["map"], caption=_plain_names(found["changes"]) or "nothing else has changed")
+
+
+def _find_table(found: dict[str, Any]) -> Table:
+    def seen(stamp_ns: int) -> str:
+        return f"{datetime.fromtimestamp(stamp_ns / 1e9):%F %R}" if has_date(stamp_ns) else f"{stamp_ns / 1e9:.1f} s"
+
+    rows = [
+        (
+            *(a["id"], a["class"], f"{a['probability'] * 100:.0f} %", f"{a['room'] or ''} {a['room_kind'] or ''}"),
+            *(_joined(a["box"]["center"]), seen(a["last_seen_ns"]) + (", gone" if a["gone_ns"] else "")),
+            "" if a["T_world_camera"] is None else _joined([row[3] for row in a["T_world_camera"][:3]]),
+        )
+        for a in found["answers"]
+    ]
+    names = ("id", "class", "probability", "room", "center, m", "last seen", "look from, m")
+    caption = _plain_names(found["answers"]) if rows else "nothing in the map fits all of it"
+    return table(rows, names, title=f"{found['map']}: {found['phrase']}", caption=caption)
 
 
 def _plain_names(things: Sequence[dict[str, Any]]) -> str:

@@ -7,18 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.map_file import open_map
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import check_up
-from semantic_mapper.queries.objects import MapObject
+from semantic_mapper.queries.objects import MapObject, ObjectMemory, remember
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.phrase import COLORS, ROOM_KINDS, NounPhrase, read_phrase
-from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box, up_in
 from semantic_mapper.queries.text_encoder import TextEncoder
 from semantic_mapper.types import Float64, UInt8
@@ -32,7 +36,7 @@ TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
 ROOM_OF_NO_KIND = 1.0  # weight of evidence, against those of ``ROOM_KINDS``
 LOOK_M, EYE_M = (0.5, 2.5), 1.2  # from a thing; height of a camera over the floor
 RADIUS_M, BODY_M, FLOORS = 0.25, (0.15, 1.5, 0.1), {"floor", "floormat"}  # of a robot; heights that it takes, step
-VIEW_DIRECTIONS, VIEW_DISTANCES, VIEW_RAYS, LEAST_VISIBLE = 24, 5, 32, 0.2
+VIEW_DIRECTIONS, VIEW_DISTANCES, VIEW_RAYS, LEAST_VISIBLE, LEVEL_M = 24, 5, 32, 0.2, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +85,20 @@ def find(
         FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
         for p, n, parts in best
     )
+
+
+def open_objects(path: Path) -> tuple[MapSnapshot, tuple[MapObject, ...]]:
+    """A saved map, and the objects that it remembers, or has now where it remembers none.
+
+    Raises MapError: as of ``VoxelMap.load``; no metres, or no floor."""
+    with open_map(path) as reader:
+        data = reader.objects()
+    if data:
+        return MapMirror.load(path).snapshot(), ObjectMemory.from_bytes(data).objects
+    voxel_map = VoxelMap.load(path)
+    if remember(voxel_map) is None:
+        raise MapError(f"{path}: things are found where lengths are metres and a floor was seen, which is not so here")
+    return MapMirror.of(voxel_map).snapshot(), ObjectMemory.from_bytes(voxel_map.objects).objects
 
 
 class _Scene:
@@ -244,7 +262,8 @@ def view_of(snapshot: MapSnapshot, thing: MapObject, up: Float64) -> Float64 | N
     rim = RADIUS_M * (np.cos(angle) * R[:, 0] + np.sin(angle) * R[:, 1])
     body = (rim[::2, None] + np.arange(*BODY_M)[:, None] * up).reshape(-1, 3)
     states = read_states((foot[:, None] + body).reshape(-1, 3) / snapshot.voxel_size_m, snapshot)
-    eyes = foot[(states.reshape(len(foot), -1) < State.OCCUPIED).all(axis=1)] + EYE_M * up
+    level_m = np.abs((foot - np.median(foot, axis=0)) @ up) < LEVEL_M  # else on what is wrongly labelled floor
+    eyes = foot[level_m & (states.reshape(len(foot), -1) < State.OCCUPIED).all(axis=1)] + EYE_M * up
     if not len(eyes):
         return None
     surface = thing.surface[:: 1 + len(thing.points) // VIEW_RAYS]

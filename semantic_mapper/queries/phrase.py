@@ -211,7 +211,9 @@ class _NounReader:
         if self._encoder is not None and _folded(nouns[-1]) != "thing":
             return NounPhrase(text.strip(), class_weights(" ".join(nouns), self._labels, self._encoder), *looks)
         if len(nouns) > 1:
-            raise MapError(f"find: '{nouns[0]}' and '{nouns[1]}' are two things; say how they lie: {', '.join(RELATIONS)}")
+            raise MapError(
+                f"find: '{nouns[0]}' and '{nouns[1]}' are two things; say how they lie: {', '.join(RELATIONS)}"
+            )
         return NounPhrase(text.strip(), self._nouns[_folded(nouns[0])], *looks)
 
     def _words(self, words: list[str]) -> Iterator[str]:
@@ -258,9 +260,14 @@ def _read_times(text: str, now_ns: int) -> tuple[str, int | None, int | None]:
     return re.sub(r" +", " ", text), after, before
 
 
+def has_date(stamp_ns: int) -> bool:
+    """Whether a stamp counts from 1970, and not from the start of a device."""
+    return stamp_ns >= _FIRST_DATE_NS
+
+
 def _moment(found: re.Match[str], now_ns: int) -> tuple[int, int]:
     """First and last stamp of what is meant: a day, or a moment."""
-    if now_ns < _FIRST_DATE_NS:
+    if not has_date(now_ns):
         raise MapError("find: the stamps of this map are no dates; ask 'in the last 10 minutes'")
     day = datetime.fromtimestamp(now_ns / 1e9).replace(hour=0, minute=0, second=0, microsecond=0)
     named, clock = found.groupdict().get("day"), found["clock"]

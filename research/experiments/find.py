@@ -1,0 +1,240 @@
+"""Are the first answers to generated phrases right? Homes of ``scenes.days``, one visit, true labels.
+
+    python -m research.experiments.find --split test
+
+A phrase has a class or a synonym and one to three of: colour, size, room, a relation; at most half of the things of its
+class fit it. What is said of a thing is true, false, or unclear by the scene itself: colours by hue and value of the
+materials, sizes and relations by the true boxes, rooms by their template. An answer is right where all is true of the
+thing there, and left out where something is unclear; so is a home's thing that no frame saw well."""
+
+from __future__ import annotations
+
+import argparse
+import colorsys
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from research.experiments.days import FRAME_NS, FRAMES, LEAST_FRAMES, LEAST_PIXELS, SPLITS, VISIT_NS, WIDTH, near
+from research.experiments.put_things import map_frame
+from research.scenes.config import NoiseConfig
+from research.scenes.days import SHELL, TEMPLATES, Home, make_home, visit
+from research.scenes.materials import Pattern
+from research.suites.config import camera_of_width
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.labels import ROOMS, STUFF_NAMES
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.find import FoundObject, find, open_objects
+from semantic_mapper.queries.objects import remember
+from semantic_mapper.types import Float64
+
+SPREAD, MANY = 0.12, {Pattern.SPINES, Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE}  # of one colour; of many
+HUES = {"red": (-15, 10), "orange": (20, 38), "yellow": (48, 65), "green": (85, 155), "blue": (205, 250)}
+HUES |= {"turquoise": (170, 192), "purple": (262, 295), "pink": (305, 340)}
+NOUNS = {"sofa": ("sofa", "couch"), "refrigerator": ("refrigerator", "fridge"), "picture": ("picture", "painting")}
+NOUNS |= {"cabinet": ("cabinet", "cupboard"), "bookshelf": ("bookshelf", "bookcase"), "otherprop": ("thing", "object")}
+NOUNS |= {"otherfurniture": ("other furniture",), "curtain": ("curtain", "drapes")}
+ROOM_NAMES = {"living": "living room"}
+TOPS = {"table", "desk", "counter", "cabinet", "otherfurniture"}
+Judged = bool | None  # None = unclear
+
+
+class Thing(NamedTuple):
+    """A true thing; ``rgb`` is None where it has no one colour."""
+
+    name: str
+    room: str
+    low: list[float]
+    high: list[float]
+    rgb: list[float] | None
+
+
+class Condition(NamedTuple):
+    """What a phrase says: words before the noun, or behind it, and whether it is so."""
+
+    before: str
+    behind: str
+    holds: Callable[[Thing], Judged]
+
+
+def make(seed: int, folder: Path) -> None:
+    """Map a home and write its map and its things."""
+    home, voxel_map = make_home(seed), VoxelMap(VoxelMapConfig(), ROOMS)
+    counts = np.zeros((len(home.rooms), 1 << 16), np.int64)
+    views = visit(home, seed, FRAMES, camera_of_width(WIDTH), NoiseConfig())
+    for number, (room, view) in enumerate(views):
+        map_frame(voxel_map, replace(view.frame, stamp_ns=20_000 * VISIT_NS + number * FRAME_NS, seq=number))
+        counts[room] += np.bincount(view.rendered.instance.ravel(), minlength=1 << 16) >= LEAST_PIXELS
+    assert remember(voxel_map) is not None
+    (folder / f"{seed}.json").write_text(json.dumps(list(things_of(home, counts))))
+    voxel_map.save(folder / f"{seed}.npz")
+
+
+def things_of(home: Home, counts: np.ndarray) -> Iterator[Thing]:
+    """The countable things that enough frames saw."""
+    for room, (scene, offset) in enumerate(zip(home.rooms, home.offsets, strict=True)):
+        p, m = scene.primitives, scene.materials
+        low, high = p.bounds()
+        for number in np.unique(p.instance[p.group >= SHELL]).tolist():
+            own = p.instance == number
+            label = int(p.label[own][0])
+            name = ROOMS.names[ROOMS.ids.index(label)] if label in ROOMS.ids else "floor"
+            if name in STUFF_NAMES or counts[room, number] < LEAST_FRAMES:
+                continue
+            rows, area = p.material[own], np.repeat(p.half[own].prod(axis=1) ** (2 / 3), 2)
+            colors: Float64 = np.stack((m.color_a[rows], m.color_b[rows]), axis=1).reshape(-1, 3) ** (1 / 2.2)
+            mean = area @ colors / area.sum()
+            spread = np.sqrt(area @ ((colors - mean) ** 2).sum(axis=1) / area.sum())
+            one = spread < SPREAD and not m.emission[rows].any() and not MANY & set(m.pattern[rows].tolist())
+            box = (low[own].min(axis=0) + offset).tolist(), (high[own].max(axis=0) + offset).tolist()
+            yield Thing(name, TEMPLATES[room], *box, mean.tolist() if one else None)
+
+
+def color_of(thing: Thing) -> str | None:
+    """Name of its colour, where nobody would give it another."""
+    if thing.rgb is None:
+        return None
+    hue, saturation, value = colorsys.rgb_to_hsv(*thing.rgb)
+    if saturation < 0.1:
+        grey = (("white", 0.85, 1.1), ("gray", 0.4, 0.65), ("black", -1, 0.2))
+        return next((name for name, least, most in grey if least <= value < most), None)
+    degrees = (hue * 360 + 20) % 360 - 20
+    if saturation > 0.45 and 0.25 < value < 0.5 and 15 < degrees < 40:
+        return "brown"
+    vivid = saturation > 0.45 and value > 0.4
+    return next((name for name, (a, b) in HUES.items() if vivid and a <= degrees < b), None)
+
+
+def conditions(thing: Thing, things: Sequence[Thing], rng: np.random.Generator) -> list[Condition]:
+    """What can be said of a thing."""
+    found = [Condition("", f"in the {ROOM_NAMES.get(thing.room, thing.room)}", lambda o: o.room == thing.room)]
+    if color := color_of(thing):
+        found.append(Condition(color, "", lambda o: None if (c := color_of(o)) is None else c == color))
+    of_class = [np.subtract(o.high, o.low) for o in things if o.name == thing.name]
+    if len(of_class) > 2:
+        for word, length in (("large", np.linalg.norm), ("tall", lambda size: size[2])):
+            median = float(np.median([length(size) for size in of_class]))
+
+            def large(o: Thing, length: Callable[[Any], Any] = length, median: float = median) -> Judged:
+                ratio = float(length(np.subtract(o.high, o.low))) / median
+                return True if ratio > 1.35 else False if ratio < 1.05 else None
+
+            if large(thing):
+                found.append(Condition(word, "", large))
+    for other in things:
+        for relation in ("near", "on"):
+            judge = {"near": _near, "on": _on}[relation]
+            if other is not thing and other.name != "otherprop" and judge(thing, other):
+                same = [o for o in things if o.name == other.name]
+
+                def related(o: Thing, judge: Any = judge, same: Sequence[Thing] = same) -> Judged:
+                    said = [judge(o, b) for b in same if b is not o]
+                    return True if True in said else None if None in said else False
+
+                noun = str(rng.choice(NOUNS.get(other.name, (other.name,))))
+                found.append(Condition("", f"{relation} the {noun}", related))
+    return found
+
+
+def _near(a: Thing, b: Thing) -> Judged:
+    apart = np.maximum(np.maximum(np.subtract(a.low, b.high), np.subtract(b.low, a.high)), 0)
+    distance = float(np.linalg.norm(apart))
+    return True if distance < 0.5 else False if distance > 1.0 or a.room != b.room else None
+
+
+def _on(a: Thing, b: Thing) -> Judged:
+    middle = np.add(a.low, a.high)[:2] / 2
+    aside = float(np.maximum(np.maximum(b.low[:2] - middle, middle - b.high[:2]), 0).max())
+    if b.name in TOPS and aside == 0 and abs(a.low[2] - b.high[2]) < 0.03:
+        return True
+    return False if aside > 0.15 or not b.low[2] + 0.1 < a.low[2] < b.high[2] + 0.3 else None
+
+
+def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> Iterator[tuple[str, list[Judged]]]:
+    """Phrases, and of each whether it is true of each thing."""
+    said = set[str]()
+    while count:
+        name = str(rng.choice(sorted({t.name for t in things})))  # classes of few things as often as of many
+        thing = things[int(rng.choice([n for n, t in enumerate(things) if t.name == name]))]
+        options = conditions(thing, things, rng)
+        chosen = [options[int(n)] for n in rng.permutation(len(options))[: int(rng.integers(1, 4))]]
+        noun = str(rng.choice(NOUNS.get(name, (name,))))
+        words = [
+            *sorted({c.before for c in chosen} - {""}, reverse=True),
+            noun,
+            *sorted({c.behind for c in chosen} - {""}),
+        ]
+        any_class = name == "otherprop"
+        fits = [None if not any_class and t.name != name else t for t in things]
+        truth = [False if t is None else _all([c.holds(t) for c in chosen]) for t in fits]
+        text, size = " ".join(words), sum(t is not None for t in fits)
+        if text not in said and 0 < truth.count(True) <= size / 2:
+            said.add(text)
+            count -= 1
+            yield text, truth
+
+
+def _all(judged: Sequence[Judged]) -> Judged:
+    return False if False in judged else None if None in judged else True
+
+
+def rank(answers: Sequence[FoundObject], things: Sequence[Thing], truth: Sequence[Judged]) -> int:
+    """Place of the first right answer, from 1; 0 = none."""
+    place = 0
+    for answer in answers:
+        o = answer.object
+        at = [n for n, t in enumerate(things) if t.name == o.class_name and near(o.box, (t.low, t.high))]
+        judged = [
+            truth[n]
+            for n in sorted(
+                at, key=lambda n: float(np.linalg.norm(np.add(things[n].low, things[n].high) / 2 - o.box.center))
+            )[:1]
+        ]
+        place += judged != [None]
+        if judged == [True]:
+            return place
+    return 0
+
+
+def main() -> None:
+    """Map what is missing, and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--split", choices=tuple(SPLITS), default="tune")
+    parser.add_argument("--phrases", type=int, default=200)
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/find"), help="maps of homes; made where they are missing"
+    )
+    parser.add_argument("--say", action="store_true", help="name each phrase whose first answer is wrong")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    ranks, seeds = list[int](), SPLITS[arguments.split]
+    for seed in seeds:
+        path = arguments.out / f"{seed}.npz"
+        if not path.exists():
+            make(seed, arguments.out)
+        things = [Thing(*row) for row in json.loads(path.with_suffix(".json").read_text())]
+        snapshot, objects = open_objects(path)
+        for text, truth in phrases(things, -(-arguments.phrases // len(seeds)), np.random.default_rng((79, seed))):
+            answers = find(text, snapshot, objects, limit=12)
+            ranks.append(rank(answers, things, truth))
+            if arguments.say and ranks[-1] != 1:
+                first = [
+                    f"{a.object.class_name} {a.object.color} {a.object.box.center.round(1)} {a.parts}"
+                    for a in answers[:1]
+                ]
+                right = [
+                    f"{t.name} {np.add(t.low, t.high).round(1) / 2}"
+                    for t, true in zip(things, truth, strict=True)
+                    if true
+                ]
+                print(f"{seed} {ranks[-1]} {text}: got {first}, true are {right[:3]}", flush=True)
+    right = [sum(0 < r <= most for r in ranks) / len(ranks) for most in (1, 5)]
+    print(f"{len(ranks)} phrases: first answer right {right[0]:.0%}, one of the first five {right[1]:.0%}")
+
+
+if __name__ == "__main__":
+    main()
