@@ -144,9 +144,9 @@ class MapClient(Closing):
     def find(
         self, phrase: str, *, limit: int = 5, up: ArrayLike | None = None, encoder: TextEncoder | None = None
     ) -> tuple[FoundObject, ...]:
-        """The objects that a phrase means ("red chair near the table"), the likeliest first, with a pose to look at each
-        from; computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of the
-        synonyms. See ``queries.find``."""
+        """The objects that a phrase means ("red chair near the table"), the likeliest first, with a pose to look at each from;
+        computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of synonyms.
+        See ``queries.find``."""
         objects = self.objects(up).objects
         snapshot, tracker = self._tracked(up)
         return find(phrase, snapshot, objects, up=tracker.up_in(snapshot), limit=limit, encoder=encoder)

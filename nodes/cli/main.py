@@ -36,6 +36,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "Use a map": {
         "query": ("query:query", "Ask a saved map, or a running mapper, what is where."),
+        "mcp": ("mcp:mcp", "Serve a map to an agent by the Model Context Protocol."),
         "info": ("info:info", "Say what a log, a map or weights hold."),
         "export": ("export:export", "Write a map, or a log, in a format of other programs."),
         "merge": ("export:merge", "Merge maps of one place into one map."),

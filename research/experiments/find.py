@@ -154,8 +154,8 @@ def _on(a: Thing, b: Thing) -> Judged:
     return False if aside > 0.15 or not b.low[2] + 0.1 < a.low[2] < b.high[2] + 0.3 else None
 
 
-def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> Iterator[tuple[str, list[Judged]]]:
-    """Phrases, and of each whether it is true of each thing."""
+def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> Iterator[tuple[str, str, list[Judged]]]:
+    """Phrases, their nouns, and of each whether it is true of each thing."""
     said = set[str]()
     while count:
         name = str(rng.choice(sorted({t.name for t in things})))  # classes of few things as often as of many
@@ -175,7 +175,7 @@ def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> It
         if text not in said and 0 < truth.count(True) <= size / 2:
             said.add(text)
             count -= 1
-            yield text, truth
+            yield text, noun, truth
 
 
 def _all(judged: Sequence[Judged]) -> Judged:
@@ -211,16 +211,19 @@ def main() -> None:
     parser.add_argument("--say", action="store_true", help="name each phrase whose first answer is wrong")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    ranks, seeds = list[int](), SPLITS[arguments.split]
+    ranks, alone, seeds = list[int](), list[int](), SPLITS[arguments.split]
     for seed in seeds:
         path = arguments.out / f"{seed}.npz"
         if not path.exists():
             make(seed, arguments.out)
         things = [Thing(*row) for row in json.loads(path.with_suffix(".json").read_text())]
         snapshot, objects = open_objects(path)
-        for text, truth in phrases(things, -(-arguments.phrases // len(seeds)), np.random.default_rng((79, seed))):
+        for text, noun, truth in phrases(
+            things, -(-arguments.phrases // len(seeds)), np.random.default_rng((79, seed))
+        ):
             answers = find(text, snapshot, objects, limit=12)
             ranks.append(rank(answers, things, truth))
+            alone.append(rank(find(noun, snapshot, objects, limit=12), things, truth))
             if arguments.say and ranks[-1] != 1:
                 first = [
                     f"{a.object.class_name} {a.object.color} {a.object.box.center.round(1)} {a.parts}"
@@ -232,8 +235,9 @@ def main() -> None:
                     if true
                 ]
                 print(f"{seed} {ranks[-1]} {text}: got {first}, true are {right[:3]}", flush=True)
-    right = [sum(0 < r <= most for r in ranks) / len(ranks) for most in (1, 5)]
-    print(f"{len(ranks)} phrases: first answer right {right[0]:.0%}, one of the first five {right[1]:.0%}")
+    for what, found in (("phrase", ranks), ("noun alone", alone)):
+        first, five = (sum(0 < r <= most for r in found) / len(found) for most in (1, 5))
+        print(f"{len(found)} x {what}: first answer right {first:.0%}, one of the first five {five:.0%}")
 
 
 if __name__ == "__main__":

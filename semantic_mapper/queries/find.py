@@ -29,6 +29,7 @@ from semantic_mapper.types import Float64, UInt8
 
 LEAST_PROBABILITY = 0.005  # of an answer
 COLOR_LIGHTNESS, COLOR_SPREAD = 0.5, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
+LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
 SIZE_SPREAD, SHADE_SPREAD = 0.12, 8.0  # logarithm of a ratio of lengths; CIELAB lightness
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
 ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
@@ -108,6 +109,8 @@ class _Scene:
         self._snapshot, self._up = snapshot, up
         self._there = [o for o in objects if o.gone_ns is None]
         self._kinds = room_kinds(self._there)
+        lightest = float(np.percentile([_lab(o.color)[0] for o in self._there] or [0.0], LIGHTEST[0]))
+        self._gain = LIGHTEST[1] / min(max(lightest, LIGHTEST[1] / 2), LIGHTEST[1])
         sizes = {n: [_sizes(o) for o in self._there if o.class_id == n] for n in {o.class_id for o in self._there}}
         self._medians = {n: np.median(rows, axis=0) for n, rows in sizes.items() if len(rows) > 1}
         labels = snapshot.label_set
@@ -117,7 +120,7 @@ class _Scene:
         """How well its class, colour and size fit."""
         parts = {"class": sum(p * noun.classes.get(n, 0.0) for n, p in thing.classes)}
         if noun.colors or noun.shade:
-            lab = _lab(thing.color)
+            lab = _lab(thing.color) * self._gain
             if noun.colors:
                 names = color_names(lab)
                 parts["color"] = max(names[name] for name in noun.colors)
