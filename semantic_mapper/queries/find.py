@@ -28,7 +28,7 @@ from semantic_mapper.queries.text_encoder import TextEncoder
 from semantic_mapper.types import Float64, UInt8
 
 LEAST_PROBABILITY = 0.005  # of an answer
-COLOR_LIGHTNESS, COLOR_SPREAD = 0.5, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
+COLOR_LIGHTNESS, COLOR_SPREAD = 0.7, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
 LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
 SIZE_SPREAD, SHADE_SPREAD = 0.12, 8.0  # logarithm of a ratio of lengths; CIELAB lightness
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
@@ -175,7 +175,7 @@ class _Scene:
                 over = low > other_low + ON_M
                 return over * float(np.exp(-(((low - top) / ON_M) ** 2) / 2)) * _soft(2 - aside / FOOTPRINT_M)
             case "under":
-                return _soft((other_high - high) / FOOTPRINT_M) * _soft(2 - aside / FOOTPRINT_M)
+                return _soft((other_low + other_high - low - high) / 2 / FOOTPRINT_M) * _soft(2 - aside / FOOTPRINT_M)
             case "above":
                 return _soft((low - other_high) / FOOTPRINT_M + 2) * _soft((ABOVE_M - aside) / FOOTPRINT_M)
             case _:  # in
@@ -262,6 +262,8 @@ def view_of(snapshot: MapSnapshot, thing: MapObject, up: Float64) -> Float64 | N
     names = dict(zip(snapshot.label_set.ids, snapshot.label_set.names, strict=True))
     floor = np.isin(down.label, [n for n, name in names.items() if name in FLOORS]) & (down.distance_m > 0)
     foot = (start - down.distance_m[:, None] * up)[floor]
+    if not len(foot):
+        return None
     rim = RADIUS_M * (np.cos(angle) * R[:, 0] + np.sin(angle) * R[:, 1])
     body = (rim[::2, None] + np.arange(*BODY_M)[:, None] * up).reshape(-1, 3)
     states = read_states((foot[:, None] + body).reshape(-1, 3) / snapshot.voxel_size_m, snapshot)
