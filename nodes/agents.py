@@ -15,7 +15,6 @@ from semantic_mapper.plots import encode_picture
 from semantic_mapper.queries.find import EYE_M, FoundObject, find, picture_of, render, room_kinds
 from semantic_mapper.queries.objects import MapObject, ObjectChange, changes_of
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import up_in
 from semantic_mapper.types import Float64, UInt8
 
 WIDTH = 640  # of pictures
@@ -32,15 +31,15 @@ class MapNow(NamedTuple):
     snapshot: MapSnapshot
     objects: tuple[MapObject, ...]
     up: Float64  # (3,) unit vector
+    since_ns: int  # after which there are changes
     changes: tuple[ObjectChange, ...]
 
 
 def read_live(client: MapClient) -> MapNow:
     """The map of a running mapper. Raises as ``MapClient.objects`` does."""
-    remembered = client.objects()
-    snapshot = client.mirror().snapshot()
+    remembered = client.objects(up := client.up())
     changes = changes_of(remembered.objects, remembered.since_ns)
-    return MapNow(snapshot, remembered.objects, up_in(snapshot), changes)
+    return MapNow(client.mirror().snapshot(), remembered.objects, up, remembered.since_ns, changes)
 
 
 class MapTools:
@@ -70,7 +69,8 @@ class MapTools:
 
     def what_changed(self) -> dict[str, Any]:
         """What was moved, is new, or has gone since the map of before, the surest first."""
-        return map_answers.answer_changes(0, self._read().changes)
+        now = self._read()
+        return map_answers.answer_changes(now.since_ns, now.changes)
 
     def describe_room(self, room: str = "") -> dict[str, Any]:
         """All rooms with their likeliest kinds and counts of things; or the things of one, by id ("2") or kind
@@ -81,7 +81,9 @@ class MapTools:
         if not wanted:
             return {"rooms": [_room(number, kinds[number], objects) for number in sorted(kinds)]}
         number = int(wanted) if wanted.isdigit() else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
-        if number not in kinds or (not wanted.isdigit() and max(kinds[number], key=kinds[number].__getitem__) != wanted):
+        if number not in kinds or (
+            not wanted.isdigit() and max(kinds[number], key=kinds[number].__getitem__) != wanted
+        ):
             names = [f"{n} ({max(k, key=k.__getitem__) or 'of no kind'})" for n, k in sorted(kinds.items())]
             raise MapError(f"no room '{room}' is known; rooms are {', '.join(names) or 'not known at all'}")
         things = [

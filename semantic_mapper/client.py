@@ -144,12 +144,17 @@ class MapClient(Closing):
     def find(
         self, phrase: str, *, limit: int = 5, up: ArrayLike | None = None, encoder: TextEncoder | None = None
     ) -> tuple[FoundObject, ...]:
-        """The objects that a phrase means ("red chair near the table"), the likeliest first, with a pose to look at each from;
+        """The objects that a phrase means ("red chair near the table"), the likeliest first, and poses to look from;
         computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of synonyms.
         See ``queries.find``."""
-        objects = self.objects(up).objects
-        snapshot, tracker = self._tracked(up)
-        return find(phrase, snapshot, objects, up=tracker.up_in(snapshot), limit=limit, encoder=encoder)
+        axis = self.up() if up is None else up
+        objects = self.objects(axis).objects
+        return find(phrase, self.mirror().snapshot(), objects, up=axis, limit=limit, encoder=encoder)
+
+    def up(self) -> Float64:
+        """Unit vector up (3,) in the world, found by the floor once; ``MapError`` where too little of it was seen."""
+        snapshot, tracker = self._tracked(None)
+        return tracker.up_in(snapshot)
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""

@@ -8,7 +8,7 @@ import pytest
 HIDDEN = """
 import sys
 FLEET = ("ray", "duckdb", "pyarrow", "fsspec", "s3fs", "gcsfs")
-for name in ("pyrealsense2", "pycolmap", "foxglove", *FLEET):
+for name in ("pyrealsense2", "pycolmap", "foxglove", "mcp", *FLEET):
     sys.modules[name] = None
 """
 
@@ -34,6 +34,10 @@ VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
         (TRY.format(REALSENSE), "pip install 'semantic-mapper[realsense]'"),
         (TRY.format("import semantic_mapper.nodes.foxglove.server"), "pip install 'semantic-mapper[foxglove]'"),
         (VERB.format(["fleet", "run", "map", __file__, "--out", "none"]), "pip install 'semantic-mapper[fleet]'"),
+        (
+            TRY.format("from semantic_mapper.nodes.agents import serve as s; s(print)"),
+            "pip install 'semantic-mapper[mcp]'",
+        ),
         (VERB.format(["fleet", "table", "none"]), "pip install 'semantic-mapper[fleet]'"),
     ],
 )

@@ -10,7 +10,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.agents import MapNow, read_live, serve
 from semantic_mapper.nodes.cli.verb import Remote, complete_launch, must_be_there, refuse_options, verb
 from semantic_mapper.queries.find import open_objects
-from semantic_mapper.queries.objects import changes_between, changes_of
+from semantic_mapper.queries.objects import ObjectMemory, changes_between, changes_of
 from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.run_folder import map_path
 from semantic_mapper.transport.launches import is_running_mapper
@@ -42,8 +42,11 @@ def mcp(
     must_be_there(*paths)
     snapshot, objects = open_objects(map_path(paths[0]))
     if since is None:
-        changes = changes_of(objects, min((o.first_seen_ns for o in objects), default=0))
+        since_ns = min((o.first_seen_ns for o in objects), default=0)
+        changes = changes_of(objects, since_ns)
     else:
-        changes = changes_between(*(VoxelMap.load(map_path(path)) for path in paths))
-    now = MapNow(snapshot, objects, up_in(snapshot), changes)
+        voxel_map, before = (VoxelMap.load(map_path(path)) for path in paths)
+        since_ns, changes = before.last_stamp_ns, changes_between(voxel_map, before)
+        objects = ObjectMemory.from_bytes(voxel_map.objects).objects  # with the ids of the changes
+    now = MapNow(snapshot, objects, up_in(snapshot), since_ns, changes)
     serve(lambda: now)

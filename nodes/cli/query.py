@@ -222,16 +222,17 @@ def _find(
     """What a phrase means, in a saved map or that of a running mapper, with a picture of each answer."""
     if live:
         with MapClient(source, server=remote.server, keys=remote.keys) as client:
-            answers, snapshot = client.find(phrase, up=up), client.mirror().snapshot()
+            answers, snapshot, axis = client.find(phrase, up=up), client.mirror().snapshot(), up or client.up()
     else:
         must_be_there(Path(source))
         snapshot, objects = open_objects(map_path(Path(source)))
-        answers = find(phrase, snapshot, objects, up=up)
+        axis = up or up_in(snapshot)
+        answers = find(phrase, snapshot, objects, up=axis)
     found = map_answers.answer_find(phrase, answers)
     for number, answer in enumerate(answers if pictures is not None else (), start=1):
         assert pictures is not None
         path = pictures / f"{number}_{answer.object.class_name}_{answer.object.id}.png"
-        write_picture(path, picture_of(snapshot, answer, np.array(up or up_in(snapshot))))
+        write_picture(path, picture_of(snapshot, answer, np.array(axis)))
         found["answers"][number - 1]["picture"] = str(path)
     return found
 

@@ -5,6 +5,7 @@ size, room and relation (softened: there is no sharp end of red or near), and th
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -219,7 +220,7 @@ def room_kinds(objects: Sequence[MapObject]) -> dict[int, dict[str, float]]:
 def color_names(lab: Float64) -> dict[str, float]:
     """Probability of each name of ``COLORS`` for a colour (3,) in CIELAB."""
     scale = np.array((COLOR_LIGHTNESS, 1, 1)) / COLOR_SPREAD
-    distance = {name: (((_COLORS[name] - lab) * scale) ** 2).sum(axis=1).min() for name in COLORS}
+    distance = {name: (((known - lab) * scale) ** 2).sum(axis=1).min() for name, known in _colors().items()}
     odds = {name: float(np.exp(-(d - min(distance.values())) / 2)) for name, d in distance.items()}
     return {name: value / sum(odds.values()) for name, value in odds.items()}
 
@@ -230,7 +231,10 @@ def _lab(rgb: UInt8) -> Float64:
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(rgb.shape).astype(np.float64)
 
 
-_COLORS = {n: _lab(np.array([[*bytes.fromhex(c)] for c in codes.split()], np.uint8)) for n, codes in COLORS.items()}
+@functools.cache
+def _colors() -> dict[str, Float64]:
+    """``COLORS`` (K, 3) in CIELAB, by name."""
+    return {n: _lab(np.array([[*bytes.fromhex(c)] for c in codes.split()], np.uint8)) for n, codes in COLORS.items()}
 
 
 def _sizes(thing: MapObject) -> Float64:

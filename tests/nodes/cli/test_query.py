@@ -170,6 +170,23 @@ def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
     assert "goes with `changes`" in said
 
 
+def test_things_are_found_by_a_phrase_with_pictures(tmp_path: Path) -> None:
+    saved = VoxelMap.received(house_changes(two_rooms(), 0), VOXEL_M, LABELS)
+    remember(saved)
+    saved.save(tmp_path / "map.npz")
+    phrase = ("find", "table", "on", "the", "floor", "--up", "z")
+    found, shown = ask(tmp_path / "map.npz", *phrase, "--pictures", tmp_path / "pictures")
+    (answer,) = found["answers"]
+    assert (answer["class"], answer["gone_ns"], found["phrase"]) == ("table", None, "table on the floor")
+    assert answer["probability"] == pytest.approx(np.prod(list(answer["parts"].values())), abs=1e-3)
+    assert Path(answer["picture"]).parent == tmp_path / "pictures" and Path(answer["picture"]).stat().st_size > 300
+    assert "look from" in shown and "table on the floor" in shown and "0.0 s" in shown
+    assert "nothing in the map fits" in ask(tmp_path / "map.npz", "find", "table on the ceiling", "--up", "z")[1]
+    assert "did you mean table" in refused("query", tmp_path / "map.npz", "find", "tabel")
+    assert "takes PHRASE" in refused("query", tmp_path / "map.npz", "find", code=2)
+    assert "goes with `find`" in refused("query", tmp_path / "map.npz", "info", "--pictures", tmp_path, code=2)
+
+
 def test_a_map_that_cannot_be_found_again_is_refused_before_the_log_is_read(tmp_path: Path) -> None:
     small_map().save(tmp_path / "map.npz")
     (tmp_path / "bad.mcap").touch()
