@@ -31,7 +31,7 @@ from semantic_mapper.types import Float64, UInt8
 LEAST_PROBABILITY = 0.005  # of an answer
 COLOR_LIGHTNESS, COLOR_SPREAD = 0.7, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
 LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
-SIZE_SPREAD, SHADE_SPREAD = 0.12, 8.0  # logarithm of a ratio of lengths; CIELAB lightness
+SIZE_SPREAD = 0.12  # logarithm of a ratio of lengths
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
 ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
 TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
@@ -120,13 +120,9 @@ class _Scene:
     def looks(self, thing: MapObject, noun: NounPhrase) -> dict[str, float]:
         """How well its class, colour and size fit."""
         parts = {"class": sum(p * noun.classes.get(n, 0.0) for n, p in thing.classes)}
-        if noun.colors or noun.shade:
-            lab = _lab(thing.color) * self._gain
-            if noun.colors:
-                names = color_names(lab)
-                parts["color"] = max(names[name] for name in noun.colors)
-            if noun.shade:
-                parts["shade"] = _soft(noun.shade * (lab[0] - 50) / SHADE_SPREAD)
+        if noun.colors:
+            names = color_names(_lab(thing.color) * self._gain)
+            parts["color"] = max(names[name] for name in noun.colors)
         for what, sign in noun.sizes:
             median = self._medians.get(thing.class_id)
             k = ("size", "height", "length").index(what)

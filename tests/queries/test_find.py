@@ -71,21 +71,21 @@ def names(classes: Any, labels: Any = THINGS) -> set[str]:
 @pytest.mark.parametrize(
     ("text", "classes", "rest"),
     [
-        ("Where is my couch?", {"sofa"}, ((), 0, (), [], ())),
-        ("the big, dark-red chairs", {"chair"}, (("red",), -1, (("size", 1),), [], ())),
-        ("a grey fridge in the kitchen", {"refrigerator"}, (("gray",), 0, (), [], ("kitchen",))),
-        ("something in room 3 next to a blue sofa", set(THINGS.names), ((), 0, (), [("near", "sofa")], (3,))),
-        ("other object on top of the coffee table", {"otherprop"}, ((), 0, (), [("on", "table")], ())),
-        ("cup under the table in the living room", {"otherprop"}, ((), 0, (), [("under", "table")], ("living room",))),
-        ("furniture by the wall", {"table", "chair", "sofa", "otherfurniture"}, ((), 0, (), [("near", "wall")], ())),
-        ("find seats above the floor", {"chair", "sofa"}, ((), 0, (), [("above", "floor")], ())),
+        ("Where is my couch?", {"sofa"}, ((), (), [], ())),
+        ("the big, red chairs", {"chair"}, (("red",), (("size", 1),), [], ())),
+        ("a grey fridge in the kitchen", {"refrigerator"}, (("gray",), (), [], ("kitchen",))),
+        ("something in room 3 next to a blue sofa", set(THINGS.names), ((), (), [("near", "sofa")], (3,))),
+        ("other object on top of the coffee table", {"otherprop"}, ((), (), [("on", "table")], ())),
+        ("cup under the table in the living room", {"otherprop"}, ((), (), [("under", "table")], ("living room",))),
+        ("furniture by the wall", {"table", "chair", "sofa", "otherfurniture"}, ((), (), [("near", "wall")], ())),
+        ("find seats above the floor", {"chair", "sofa"}, ((), (), [("above", "floor")], ())),
     ],
 )
 def test_a_phrase_is_a_thing_its_looks_relations_and_rooms(text: str, classes: set[str], rest: tuple) -> None:
     found = read_phrase(text, THINGS, at(15))
     assert names(found.thing.classes) == classes and (found.after_ns, found.before_ns) == (None, None)
     (*looks, relations, rooms), noun = rest, found.thing
-    assert [noun.colors, noun.shade, noun.sizes] == looks and found.rooms == rooms
+    assert [noun.colors, noun.sizes] == looks and found.rooms == rooms
     assert [(r, *names(o.classes)) for r, o in found.relations] == relations
 
 
@@ -185,7 +185,7 @@ def test_probabilities_are_products_of_parts_and_of_what_is_still_there() -> Non
     there, gone = (next(a for a in find("other object", HOUSE, KITCHEN, up=UP) if a.object.id == n) for n in (6, 7))
     assert there.probability == pytest.approx(0.9) and gone.probability == pytest.approx(0.9 * 0.3)
     (red, *_) = find("red chair in the kitchen near the wall", HOUSE, KITCHEN, up=UP)
-    assert list(red.parts) == ["class", "color", "kitchen", "there", "near the wall"]
+    assert list(red.parts) == ["class", "color", "kitchen", "there", "near wall"]
     assert red.probability == pytest.approx(np.prod(list(red.parts.values()))) and red.room_kind == "kitchen"
     missed = [replace(KITCHEN[1], missed=10)]
     assert find("chair", HOUSE, missed, up=UP)[0].parts["there"] == pytest.approx(0.5)
