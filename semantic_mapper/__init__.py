@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from semantic_mapper.mapping.floor_plan import OccupancyGrid
     from semantic_mapper.mapping.map_types import CameraPose, MapPoints
     from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.queries.find import FoundObject
     from semantic_mapper.queries.graph import Door, Floor, Room, SceneGraph
     from semantic_mapper.queries.instances import Instance, OrientedBox
     from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from semantic_mapper.queries.questions import Correction, MapInfo, RememberedObjects, Weights, WeightsEntry
     from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
     from semantic_mapper.queries.surface import RayHits
+    from semantic_mapper.queries.text_encoder import TextEncoder
     from semantic_mapper.replay.log.sequence import open_log
     from semantic_mapper.training.finetune import finetune
     from semantic_mapper.types import PosedFrame
@@ -38,6 +40,7 @@ __all__ = [
     "DistanceField",
     "Door",
     "Floor",
+    "FoundObject",
     "Instance",
     "LabelSet",
     "MapClient",
@@ -59,6 +62,7 @@ __all__ = [
     "SceneGraph",
     "SemanticMapperError",
     "State",
+    "TextEncoder",
     "VoxelMap",
     "Weights",
     "WeightsEntry",
@@ -86,6 +90,7 @@ _HOMES = {  # modules below this package, by name; where it is called otherwise 
     "OccupancyGrid": "mapping.floor_plan",
     **dict.fromkeys(("CameraPose", "MapPoints"), "mapping.map_types"),
     "VoxelMap": "mapping.voxel_map",
+    "FoundObject": "queries.find",
     **dict.fromkeys(("Door", "Floor", "Room", "SceneGraph"), "queries.graph"),
     **dict.fromkeys(("Instance", "OrientedBox"), "queries.instances"),
     **dict.fromkeys(("NearestSurface", "PointAnswers"), "queries.nearest"),
@@ -94,6 +99,7 @@ _HOMES = {  # modules below this package, by name; where it is called otherwise 
     **dict.fromkeys(("Correction", "MapInfo", "RememberedObjects", "Weights", "WeightsEntry"), "queries.questions"),
     **dict.fromkeys(("MapMirror", "MapSnapshot"), "queries.snapshot"),
     "RayHits": "queries.surface",
+    "TextEncoder": "queries.text_encoder",
     "open_log": "replay.log.sequence",
     "finetune": "training.finetune",
     "PosedFrame": "types",

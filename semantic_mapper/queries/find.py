@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import scipy  # loads `spatial` when it is first used
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
@@ -20,11 +21,12 @@ from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import check_up
+from semantic_mapper.queries.instances import thing_voxels
 from semantic_mapper.queries.objects import MapObject, ObjectMemory, remember
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.phrase import COLORS, ROOM_KINDS, NounPhrase, read_phrase
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.queries.surface import cast_rays, points_in_box, up_in
+from semantic_mapper.queries.surface import cast_rays, up_in
 from semantic_mapper.queries.text_encoder import TextEncoder
 from semantic_mapper.types import Float64, UInt8
 
@@ -80,8 +82,10 @@ def find(
         if (probability := float(np.prod(list(parts.values())))) >= LEAST_PROBABILITY:
             found.append((probability, n, parts))
     for relation, noun in phrase.relations:
-        found = [(p * r, n, parts | {f"{relation} {noun.text}": r}) for p, n, parts in found
-                 if p * (r := scene.related(objects[n], relation, noun)) >= LEAST_PROBABILITY]  # fmt: skip
+        fits = scene.related([objects[n] for _, n, _ in found], relation, noun)
+        name = f"{relation} {noun.text}"
+        found = [(p * fit, n, parts | {name: fit}) for (p, n, parts), fit in zip(found, fits, strict=True)]
+        found = [answer for answer in found if answer[0] >= LEAST_PROBABILITY]
     best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[:limit]
     return tuple(
         FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
@@ -115,7 +119,7 @@ class _Scene:
         sizes = {n: [_sizes(o) for o in self._there if o.class_id == n] for n in {o.class_id for o in self._there}}
         self._medians = {n: np.median(rows, axis=0) for n, rows in sizes.items() if len(rows) > 1}
         labels = snapshot.label_set
-        self._stuff = {n for n, name in zip(labels.ids, labels.names, strict=True) if name in STUFF_NAMES}
+        self._stuff = {n: name for n, name in zip(labels.ids, labels.names, strict=True) if name in STUFF_NAMES}
 
     def looks(self, thing: MapObject, noun: NounPhrase) -> dict[str, float]:
         """How well its class, colour and size fit."""
@@ -140,17 +144,33 @@ class _Scene:
             return float(thing.room == room)
         return self._kinds.get(thing.room or 0, {}).get(room, 0.0)
 
-    def related(self, thing: MapObject, relation: str, noun: NounPhrase) -> float:
-        """How well a thing stands in a relation to any other that fits a noun."""
-        best = self._touches(thing, relation, noun)
-        for other in self._there:
-            reach = np.linalg.norm(thing.box.size) / 2 + np.linalg.norm(other.box.size) / 2 + 2 * NEAR_M
-            if other.id == thing.id or np.linalg.norm(thing.box.center - other.box.center) > reach:
-                continue
-            fits = float(np.prod(list(self.looks(other, noun).values())))
-            if fits > best:
-                best = max(best, fits * self._relation(thing, other, relation))
-        return best
+    def related(self, things: Sequence[MapObject], relation: str, noun: NounPhrase) -> list[float]:
+        """How well things stand in a relation to any other that fits a noun."""
+        found = self._touch(things, relation, noun)
+        fits = [(o, float(np.prod(list(self.looks(o, noun).values())))) for o in self._there]
+        for other, fit in [of for of in fits if of[1] >= LEAST_PROBABILITY]:
+            for n, thing in enumerate(things):
+                reach = np.linalg.norm(thing.box.size) / 2 + np.linalg.norm(other.box.size) / 2 + 2 * NEAR_M
+                near = other.id != thing.id and np.linalg.norm(thing.box.center - other.box.center) < reach
+                if near and fit > found[n]:
+                    found[n] = max(found[n], fit * self._relation(thing, other, relation))
+        return found
+
+    def _touch(self, things: Sequence[MapObject], relation: str, noun: NounPhrase) -> list[float]:
+        """Likewise to what is no object, such as walls and the floor."""
+        stuff = [n for n in noun.classes if n in self._stuff]
+        if not stuff or relation not in ("on", "near"):
+            return [0.0] * len(things)
+        limit, spread = (TOUCH_M, TOUCH_SPREAD_M) if relation == "on" else (NEAR_M, NEAR_SPREAD_M)
+        points = thing_voxels(self._snapshot, np.isin(np.arange(256), stuff)).point[::2]
+        tree, found = scipy.spatial.cKDTree(points * self._snapshot.voxel_size_m), list[float]()
+        for thing in things:
+            xyz, height = thing.surface, thing.surface @ self._up
+            if {self._stuff[n] for n in stuff} <= FLOORS:  # what hangs low at a wall is not on the floor
+                xyz = xyz[height <= height.min() + TOUCH_M]
+            distance = tree.query(xyz, distance_upper_bound=limit + 6 * spread)[0].min()
+            found.append(_soft((limit - distance) / spread))
+        return found
 
     def _relation(self, thing: MapObject, other: MapObject, relation: str) -> float:
         up, surface = self._up, thing.surface
@@ -177,24 +197,6 @@ class _Scene:
                 return _soft((low - other_high) / FOOTPRINT_M + 2) * _soft((ABOVE_M - aside) / FOOTPRINT_M)
             case _:  # in
                 return _soft(2 - float(np.linalg.norm(offset)) / (FOOTPRINT_M / 2))
-
-    def _touches(self, thing: MapObject, relation: str, noun: NounPhrase) -> float:
-        """Of what is no object, such as walls and the floor."""
-        wanted = [n for n in noun.classes if n in self._stuff]
-        if not wanted or relation not in ("on", "near") or not self._snapshot.block_count:
-            return 0.0
-        limit, spread = (TOUCH_M, TOUCH_SPREAD_M) if relation == "on" else (NEAR_M, NEAR_SPREAD_M)
-        xyz, reach = thing.surface, limit + 3 * spread
-        names = {self._snapshot.label_set.names[self._snapshot.label_set.ids.index(n)] for n in wanted}
-        if names <= FLOORS:  # what hangs low at a wall is not on the floor
-            xyz = xyz[xyz @ self._up <= (xyz @ self._up).min() + TOUCH_M]
-        points = points_in_box(self._snapshot, xyz.min(axis=0) - reach, xyz.max(axis=0) + reach)
-        near = points.xyz[np.isin(points.label, wanted)].astype(np.float64)
-        if not len(near):
-            return 0.0
-        near = near[:: 1 + len(near) // 4000]
-        squares = (xyz**2).sum(axis=1)[:, None] + (near**2).sum(axis=1) - 2 * xyz @ near.T
-        return _soft((limit - float(np.sqrt(max(squares.min(), 0)))) / spread)
 
 
 def room_kinds(objects: Sequence[MapObject]) -> dict[int, dict[str, float]]:

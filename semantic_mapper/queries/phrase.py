@@ -170,7 +170,8 @@ def _moment(found: re.Match[str], now_ns: int) -> tuple[int, int]:
     at, named, clock = datetime.fromtimestamp(now_ns // 10**9), found.groupdict().get("day"), found["clock"]
     at = at.replace(hour=0, minute=0, second=0)
     try:
-        at = datetime.fromisoformat(named) if named and named[0].isdigit() else at - timedelta(days=named == "yesterday")
+        at = at - timedelta(days=named == "yesterday")
+        at = datetime.fromisoformat(named) if named and named[0].isdigit() else at
         if clock is None:
             return _stamp(at), _stamp(at + timedelta(days=1))
         hour, _, minute = re.sub(r" ?[ap]m", "", {"noon": "12", "midnight": "0"}.get(clock, clock)).partition(":")
