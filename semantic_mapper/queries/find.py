@@ -86,7 +86,7 @@ def find(
         name = f"{relation} {noun.text}"
         found = [(p * fit, n, parts | {name: fit}) for (p, n, parts), fit in zip(found, fits, strict=True)]
         found = [answer for answer in found if answer[0] >= LEAST_PROBABILITY]
-    best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[:limit]
+    best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[: max(limit, 0)]
     return tuple(
         FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
         for p, n, parts in best

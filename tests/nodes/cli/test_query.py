@@ -19,7 +19,7 @@ from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.contract.entry_points import serving
-from tests.contract.golden import MAP
+from tests.contract.golden import MAP, form, undocumented
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_odometry_sessions import INTRINSICS, abroad, even, off, other_world, walk
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -177,6 +177,7 @@ def test_things_are_found_by_a_phrase_with_pictures(tmp_path: Path) -> None:
     phrase = ("find", "table", "on", "the", "floor", "--up", "z")
     found, shown = ask(tmp_path / "map.npz", *phrase, "--pictures", tmp_path / "pictures")
     (answer,) = found["answers"]
+    assert undocumented("query", form(found)) == []
     assert (answer["class"], answer["gone_ns"], found["phrase"]) == ("table", None, "table on the floor")
     assert answer["probability"] == pytest.approx(np.prod(list(answer["parts"].values())), abs=1e-3)
     assert Path(answer["picture"]).parent == tmp_path / "pictures" and Path(answer["picture"]).stat().st_size > 300
