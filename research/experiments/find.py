@@ -5,7 +5,7 @@
 A phrase has a class or a synonym and one to three of: colour, size, room, a relation; at most half of the things of its
 class fit it. What is said of a thing is true, false, or unclear by the scene itself: colours by hue and value of the
 materials, sizes and relations by the true boxes, rooms by their template. An answer is right where all is true of the
-thing there, and left out where something is unclear; so is a home's thing that no frame saw well."""
+thing there, and left out where something is unclear. Things that too few frames saw do not count."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ HUES |= {"turquoise": (170, 192), "purple": (262, 295), "pink": (305, 340)}
 NOUNS = {"sofa": ("sofa", "couch"), "refrigerator": ("refrigerator", "fridge"), "picture": ("picture", "painting")}
 NOUNS |= {"cabinet": ("cabinet", "cupboard"), "bookshelf": ("bookshelf", "bookcase"), "otherprop": ("thing", "object")}
 NOUNS |= {"otherfurniture": ("other furniture",), "curtain": ("curtain", "drapes")}
-ROOM_NAMES = {"living": "living room"}
 TOPS = {"table", "desk", "counter", "cabinet", "otherfurniture"}
 Judged = bool | None  # None = unclear
+Condition = tuple[str, str, Callable[["Thing"], Judged]]  # words before the noun, behind it, and whether it is so
 
 
 class Thing(NamedTuple):
@@ -51,14 +51,6 @@ class Thing(NamedTuple):
     low: list[float]
     high: list[float]
     rgb: list[float] | None
-
-
-class Condition(NamedTuple):
-    """What a phrase says: words before the noun, or behind it, and whether it is so."""
-
-    before: str
-    behind: str
-    holds: Callable[[Thing], Judged]
 
 
 def make(seed: int, folder: Path) -> None:
@@ -75,7 +67,7 @@ def make(seed: int, folder: Path) -> None:
 
 
 def things_of(home: Home, counts: np.ndarray) -> Iterator[Thing]:
-    """The countable things that enough frames saw."""
+    """The countable things that enough frames saw, by how many saw each (rooms, instances)."""
     for room, (scene, offset) in enumerate(zip(home.rooms, home.offsets, strict=True)):
         p, m = scene.primitives, scene.materials
         low, high = p.bounds()
@@ -105,29 +97,28 @@ def color_of(thing: Thing) -> str | None:
     degrees = (hue * 360 + 20) % 360 - 20
     if saturation > 0.45 and 0.25 < value < 0.5 and 15 < degrees < 40:
         return "brown"
-    vivid = saturation > 0.45 and value > 0.4
-    return next((name for name, (a, b) in HUES.items() if vivid and a <= degrees < b), None)
+    return next((name for name, (a, b) in HUES.items() if min(saturation, value) > 0.4 and a <= degrees < b), None)
 
 
 def conditions(thing: Thing, things: Sequence[Thing], rng: np.random.Generator) -> list[Condition]:
     """What can be said of a thing."""
-    found = [Condition("", f"in the {ROOM_NAMES.get(thing.room, thing.room)}", lambda o: o.room == thing.room)]
+    room = "living room" if thing.room == "living" else thing.room
+    found: list[Condition] = [("", f"in the {room}", lambda o: o.room == thing.room)]
     if color := color_of(thing):
-        found.append(Condition(color, "", lambda o: None if (c := color_of(o)) is None else c == color))
+        found.append((color, "", lambda o: None if (c := color_of(o)) is None else c == color))
     of_class = [np.subtract(o.high, o.low) for o in things if o.name == thing.name]
-    if len(of_class) > 2:
-        for word, length in (("large", np.linalg.norm), ("tall", lambda size: size[2])):
-            median = float(np.median([length(size) for size in of_class]))
+    lengths: tuple[tuple[str, Callable[[Any], Any]], ...] = (("large", np.linalg.norm), ("tall", lambda size: size[2]))
+    for word, length in lengths if len(of_class) > 2 else ():
+        median = float(np.median([length(size) for size in of_class]))
 
-            def large(o: Thing, length: Callable[[Any], Any] = length, median: float = median) -> Judged:
-                ratio = float(length(np.subtract(o.high, o.low))) / median
-                return True if ratio > 1.35 else False if ratio < 1.05 else None
+        def large(o: Thing, length: Callable[[Any], Any] = length, median: float = median) -> Judged:
+            ratio = float(length(np.subtract(o.high, o.low))) / median
+            return True if ratio > 1.35 else False if ratio < 1.05 else None
 
-            if large(thing):
-                found.append(Condition(word, "", large))
+        if large(thing):
+            found.append((word, "", large))
     for other in things:
-        for relation in ("near", "on"):
-            judge = {"near": _near, "on": _on}[relation]
+        for relation, judge in (("near", _near), ("on", _on)):
             if other is not thing and other.name != "otherprop" and judge(thing, other):
                 same = [o for o in things if o.name == other.name]
 
@@ -136,7 +127,7 @@ def conditions(thing: Thing, things: Sequence[Thing], rng: np.random.Generator) 
                     return True if True in said else None if None in said else False
 
                 noun = str(rng.choice(NOUNS.get(other.name, (other.name,))))
-                found.append(Condition("", f"{relation} the {noun}", related))
+                found.append(("", f"{relation} the {noun}", related))
     return found
 
 
@@ -157,29 +148,19 @@ def _on(a: Thing, b: Thing) -> Judged:
 def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> Iterator[tuple[str, str, list[Judged]]]:
     """Phrases, their nouns, and of each whether it is true of each thing."""
     said = set[str]()
-    while count:
+    while len(said) < count:
         name = str(rng.choice(sorted({t.name for t in things})))  # classes of few things as often as of many
         thing = things[int(rng.choice([n for n, t in enumerate(things) if t.name == name]))]
         options = conditions(thing, things, rng)
         chosen = [options[int(n)] for n in rng.permutation(len(options))[: int(rng.integers(1, 4))]]
         noun = str(rng.choice(NOUNS.get(name, (name,))))
-        words = [
-            *sorted({c.before for c in chosen} - {""}, reverse=True),
-            noun,
-            *sorted({c.behind for c in chosen} - {""}),
-        ]
-        any_class = name == "otherprop"
-        fits = [None if not any_class and t.name != name else t for t in things]
-        truth = [False if t is None else _all([c.holds(t) for c in chosen]) for t in fits]
-        text, size = " ".join(words), sum(t is not None for t in fits)
-        if text not in said and 0 < truth.count(True) <= size / 2:
+        before, behind = (sorted({c[k] for c in chosen} - {""}, reverse=not k) for k in (0, 1))
+        text, fits = " ".join([*before, noun, *behind]), [name in (t.name, "otherprop") for t in things]
+        holds = [[c[2](t) for c in chosen] if fit else [False] for t, fit in zip(things, fits, strict=True)]
+        truth: list[Judged] = [False if False in h else None if None in h else True for h in holds]
+        if text not in said and 0 < truth.count(True) <= sum(fits) / 2:
             said.add(text)
-            count -= 1
             yield text, noun, truth
-
-
-def _all(judged: Sequence[Judged]) -> Judged:
-    return False if False in judged else None if None in judged else True
 
 
 def rank(answers: Sequence[FoundObject], things: Sequence[Thing], truth: Sequence[Judged]) -> int:
@@ -187,15 +168,12 @@ def rank(answers: Sequence[FoundObject], things: Sequence[Thing], truth: Sequenc
     place = 0
     for answer in answers:
         o = answer.object
-        at = [n for n, t in enumerate(things) if t.name == o.class_name and near(o.box, (t.low, t.high))]
-        judged = [
-            truth[n]
-            for n in sorted(
-                at, key=lambda n: float(np.linalg.norm(np.add(things[n].low, things[n].high) / 2 - o.box.center))
-            )[:1]
-        ]
-        place += judged != [None]
-        if judged == [True]:
+        middles = np.array([np.add(t.low, t.high) / 2 for t in things])
+        order = np.linalg.norm(middles - o.box.center, axis=1).argsort()
+        there = (n for n in order if things[n].name == o.class_name and near(o.box, (things[n].low, things[n].high)))
+        judged = truth[n] if (n := next(there, None)) is not None else False
+        place += judged is not None
+        if judged:
             return place
     return 0
 
@@ -225,16 +203,8 @@ def main() -> None:
             ranks.append(rank(answers, things, truth))
             alone.append(rank(find(noun, snapshot, objects, limit=12), things, truth))
             if arguments.say and ranks[-1] != 1:
-                first = [
-                    f"{a.object.class_name} {a.object.color} {a.object.box.center.round(1)} {a.parts}"
-                    for a in answers[:1]
-                ]
-                right = [
-                    f"{t.name} {np.add(t.low, t.high).round(1) / 2}"
-                    for t, true in zip(things, truth, strict=True)
-                    if true
-                ]
-                print(f"{seed} {ranks[-1]} {text}: got {first}, true are {right[:3]}", flush=True)
+                got = [f"{a.object.class_name} {a.object.box.center.round(1)} {dict(a.parts)}" for a in answers[:1]]
+                print(f"{seed} {ranks[-1]} {text}: got {got}", flush=True)
     for what, found in (("phrase", ranks), ("noun alone", alone)):
         first, five = (sum(0 < r <= most for r in found) / len(found) for most in (1, 5))
         print(f"{len(found)} x {what}: first answer right {first:.0%}, one of the first five {five:.0%}")
