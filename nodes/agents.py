@@ -77,14 +77,13 @@ class MapTools:
         ("kitchen"). Kinds are judged by what stands there."""
         objects = [o for o in self._read().objects if o.gone_ns is None]
         kinds = room_kinds(objects)
-        wanted = room.casefold().removeprefix("room").strip()
+        wanted = room.casefold().removeprefix("the ").removeprefix("room").strip()
         if not wanted:
             return {"rooms": [_room(number, kinds[number], objects) for number in sorted(kinds)]}
         number = int(wanted) if wanted.isdigit() else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
-        if number not in kinds or (
-            not wanted.isdigit() and max(kinds[number], key=kinds[number].__getitem__) != wanted
-        ):
-            names = [f"{n} ({max(k, key=k.__getitem__) or 'of no kind'})" for n, k in sorted(kinds.items())]
+        likeliest = {n: max(kind, key=kind.__getitem__) for n, kind in sorted(kinds.items())}
+        if number not in kinds or not (wanted.isdigit() or likeliest[number] == wanted):
+            names = [f"{n} ({kind or 'of no kind'})" for n, kind in likeliest.items()]
             raise MapError(f"no room '{room}' is known; rooms are {', '.join(names) or 'not known at all'}")
         things = [
             {
@@ -109,7 +108,7 @@ class MapTools:
         places = [np.array(p or (), np.float64) for p in (eye, target)]
         if any(p.shape != (3,) for p in places):
             raise MapError("look: give a phrase, or eye and target, [x, y, z] each")
-        return render(now.snapshot, look_at(*places, now.up), WIDTH)
+        return render(now.snapshot, look_at(places[0], places[1], now.up), WIDTH)
 
 
 def serve(read: Callable[[], MapNow]) -> None:

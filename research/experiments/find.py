@@ -154,7 +154,7 @@ def phrases(things: Sequence[Thing], count: int, rng: np.random.Generator) -> It
         options = conditions(thing, things, rng)
         chosen = [options[int(n)] for n in rng.permutation(len(options))[: int(rng.integers(1, 4))]]
         noun = str(rng.choice(NOUNS.get(name, (name,))))
-        before, behind = (sorted({c[k] for c in chosen} - {""}, reverse=not k) for k in (0, 1))
+        before, behind = sorted({c[0] for c in chosen} - {""}, reverse=True), sorted({c[1] for c in chosen} - {""})
         text, fits = " ".join([*before, noun, *behind]), [name in (t.name, "otherprop") for t in things]
         holds = [[c[2](t) for c in chosen] if fit else [False] for t, fit in zip(things, fits, strict=True)]
         truth: list[Judged] = [False if False in h else None if None in h else True for h in holds]
