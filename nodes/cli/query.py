@@ -231,7 +231,7 @@ def _find(
     found = map_answers.answer_find(phrase, answers)
     for number, answer in enumerate(answers if pictures is not None else (), start=1):
         assert pictures is not None
-        path = pictures / f"{number}_{answer.object.class_name}_{answer.object.id}.png"
+        path = pictures / f"{number}_object_{answer.object.id}.png"
         write_picture(path, picture_of(snapshot, answer, np.array(axis)))
         found["answers"][number - 1]["picture"] = str(path)
     return found
