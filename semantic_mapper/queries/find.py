@@ -78,7 +78,7 @@ def find(
             parts[f"room {room}" if isinstance(room, int) else room] = scene.in_room(thing, room)
         if not (phrase.after_ns or 0) <= thing.last_seen_ns < (phrase.before_ns or 2**63):
             continue
-        parts["there"] = 1 - thing.certainty if thing.gone_ns else (1 + thing.views) / (1 + thing.views + thing.missed)
+        parts["there"] = thing.present
         if (probability := float(np.prod(list(parts.values())))) >= LEAST_PROBABILITY:
             found.append((probability, n, parts))
     for relation, noun in phrase.relations:

@@ -187,7 +187,7 @@ def test_probabilities_are_products_of_parts_and_of_what_is_still_there() -> Non
     (red, *_) = find("red chair in the kitchen near the wall", HOUSE, KITCHEN, up=UP)
     assert list(red.parts) == ["class", "color", "kitchen", "there", "near wall"]
     assert red.probability == pytest.approx(np.prod(list(red.parts.values()))) and red.room_kind == "kitchen"
-    missed = [replace(KITCHEN[1], missed=10)]
+    missed = [replace(KITCHEN[1], missed=1)]
     assert find("chair", HOUSE, missed, up=UP)[0].parts["there"] == pytest.approx(0.5)
     kinds = room_kinds(KITCHEN)
     assert kinds[1]["kitchen"] > 0.5 and kinds[2]["bathroom"] > 0.8
