@@ -582,7 +582,8 @@ def _explain(message: str, kind: type[msgspec.Struct]) -> str:
 
 def nearest(wrong: str, valid: Sequence[str]) -> str:
     """How a message about a wrong name ends: with the valid one that is nearest, else with all."""
-    near = difflib.get_close_matches(wrong, valid, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(wrong, valid, n=3, cutoff=0.5)
+    near.sort(key=lambda name: sorted(name) != sorted(wrong))  # letters that have changed places come first
     return f"; did you mean `{near[0]}`?" if near else f"; there are {', '.join(valid) or 'none'}"
 
 

@@ -16,8 +16,11 @@ from rich.table import Table
 from semantic_mapper.client import UP, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction, nearest_path
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError, TransportError
+from semantic_mapper.geometry import transform
 from semantic_mapper.labels import PLAIN_NAMES
+from semantic_mapper.localization.places import shared_places
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -44,6 +47,7 @@ from semantic_mapper.queries.objects import changes_between, changes_of
 from semantic_mapper.queries.phrase import has_date
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import up_in
+from semantic_mapper.replay.changes_picture import draw_changes
 from semantic_mapper.replay.exporters.map_files import parse_up
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.relocalize import relocalize_frames
@@ -81,16 +85,14 @@ def query(
     source: Annotated[str, typer.Argument(metavar="MAP", autocompletion=complete_launch)],
     question: Question,
     remote: Remote,
-    arguments: Annotated[
-        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z] [PHRASE] [LOG]", autocompletion=_classes)
-    ] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(metavar="[ABOUT]", autocompletion=_classes)] = None,
     *,
     up: UpOption = "auto",
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least
     gone: bool = False,  # instances, running mapper: gone ones, too
     unsure: bool = False,  # nearest, instances: also below the least certainty
-    picture: Path | None = None,  # graph: also draw it from above (.png)
-    since: Path | None = None,  # changes: map of before; of a running mapper, the one that it goes on in
+    picture: Path | None = None,  # graph, changes of saved maps: drawn too (.png)
+    since: Path | None = None,  # changes of a saved map: the one before
     pictures: Path | None = None,  # find: folder for a picture of each answer
     every: AtLeastOne = 1,  # relocalize: every n-th frame
 ) -> int:
@@ -99,13 +101,11 @@ def query(
     info: size and classes. at X Y Z: class at a point, whose box it is in, and whether it is free, occupied or
     unknown. nearest CLASS X Y Z: the nearest surface of a class, and its thing. instances: countable things with
     upright boxes, certainty and the fraction seen. graph: floors, rooms, doors, and things by room. changes: what was
-    moved, is new or has gone since another map. find PHRASE: remembered things by class or synonym, colour, size, room
-    (`in room 2`, `in the kitchen`: by what stands there), relation (near, on, under, above, in) and time. relocalize
-    LOG: find frames with measured depth in a saved map; exit code 1 where they do not agree.
+    moved, is new or has gone since another map. find PHRASE: remembered things by class, colour, size, room (`in room
+    2`, `in the kitchen`), relation (near, on, under, above, in) and time. relocalize LOG: find frames with measured
+    depth in a saved map; exit code 1 where they do not agree.
 
-    Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
-    Example: semantic-mapper query runs/demo graph --picture rooms.png
     Example: semantic-mapper query runs/today changes --since runs/yesterday
     Example: semantic-mapper query live find "red chair near the table, last seen before noon" --pictures found
     Example: semantic-mapper query tcp://robot:5570 info --server robot
@@ -118,7 +118,11 @@ def query(
     refuse_options(
         (gone and not (live and question == "instances"), "--gone", "goes with `instances` of a running mapper"),
         (unsure and question not in ("nearest", "instances"), "--unsure", "goes with `nearest` and `instances`"),
-        (picture is not None and question != "graph", "--picture", "goes with `graph`"),
+        (
+            picture is not None and (question not in ("graph", "changes") or (question == "changes" and live)),
+            "--picture",
+            "goes with `graph`, and with `changes` of a saved map",
+        ),
         (pictures is not None and question != "find", "--pictures", "goes with `find`"),
         (since is not None and (live or question != "changes"), "--since", "goes with `changes` of a saved map"),
     )
@@ -135,7 +139,7 @@ def query(
         found = {"map": source, **_find(source, name, axis, pictures, remote, live=live)}
         output.print(answer_table(found))
     elif question == "changes" and not live:
-        found = {"map": source, **_saved_changes(source, since)}
+        found = {"map": source, **_saved_changes(source, since, picture)}
         output.print(answer_table(found))
     else:
         client = MapClient(source, server=remote.server, keys=remote.keys) if live else nullcontext(open_saved(source))
@@ -147,7 +151,7 @@ def query(
             output.print("nothing is certain enough to be listed; --unsure lists all candidates")
     output.json(found)
     if picture is not None:
-        if not found["floors"]:
+        if question == "graph" and not found["floors"]:
             raise MapError(f"{picture} is not drawn: {map_answers.NO_FLOOR}")
         output.print(f"written to {picture}")
     return code
@@ -207,13 +211,22 @@ def answer(
             return map_answers.answer_graph(graph)
 
 
-def _saved_changes(source: str, since: Path | None) -> dict[str, Any]:
-    """What has changed between two saved maps."""
+def _saved_changes(source: str, since: Path | None, picture: Path | None) -> dict[str, Any]:
+    """What has changed between two saved maps, and a picture of it."""
     if since is None:
         raise ConfigError("`changes` of a saved map needs the map of before: --since MAP")
     must_be_there(Path(source), since)
     before, now = (VoxelMap.load(map_path(path)) for path in (since, Path(source)))
-    return map_answers.answer_changes(before.last_stamp_ns, changes_between(now, before))
+    changes = changes_between(now, before)
+    if picture is not None:
+        points, T = before.points(), np.eye(4)
+        if not shared_places(now.places.places, before.places.places):
+            T = find_alignment(now, before).T_map_other
+        xyz = transform(T, points.xyz.astype(np.float64)).astype(np.float32)
+        up = up_in(MapMirror.of(now).snapshot())
+        title = f"{since} and {source}"
+        write_picture(picture, draw_changes(replace(points, xyz=xyz), now.points(), changes, up, title=title))
+    return map_answers.answer_changes(before.last_stamp_ns, changes)
 
 
 def _find(

@@ -37,7 +37,7 @@ def filled_grid(memory_bytes: int) -> BlockGrid:
 
 def snapshot_of(grid: BlockGrid) -> FrozenMap:
     manifest = MapManifest(config=VoxelMapConfig(), label_set=LABELS, frames=1, last_stamp_ns=0)
-    return FrozenMap(grid, threading.Lock(), manifest, ())
+    return FrozenMap(grid, threading.Lock(), manifest, (), b"")
 
 
 @pytest.mark.parametrize("most_in_memory", [map_snapshot.MOST_IN_MEMORY, 30], ids=["copies in memory", "on disk"])
