@@ -107,7 +107,7 @@ def query(
 
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
     Example: semantic-mapper query runs/today changes --since runs/yesterday
-    Example: semantic-mapper query live find "red chair near the table, last seen before noon" --pictures found
+    Example: semantic-mapper query live find "red chair near the table"
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     name, point = _read_arguments(question, arguments or [])
