@@ -27,7 +27,8 @@ COLORS = {"moved": "#ffd21f", "new": "#3fe07f", "gone": "#ff5a4f"}
 def draw_changes(
     before: MapPoints, now: MapPoints, changes: Sequence[ObjectChange], up: Float64, *, title: str
 ) -> Figure:
-    """Both maps (in the world of ``now``) without their ceilings, 1600 pixels wide; ``up`` is (3,) in that world."""
+    """Both maps (in the world of ``now``) without ceilings, with the ids of what has changed, 1600 pixels wide; ``up``
+    is (3,) in that world."""
     size = ((WIDTH - 3 * MARGIN) // 2, HEIGHT - TOP - MARGIN)
     R = plan_rotation(now.xyz, up)
     shown = [_without_ceiling(points, up) for points in (before, now)]
@@ -54,7 +55,7 @@ def draw_changes(
             if place is None:
                 continue
             color = COLORS[change.kind]
-            _put_box(axes, pixels(_corners(place.box)), f"{change.object.class_name} {change.object.id}", color)
+            _put_box(axes, pixels(_corners(place.box)), str(change.object.id), color)
             if column and change.kind == "moved" and old is not None:
                 start, end = pixels(np.stack((old.box.center, place.box.center)))
                 axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": color, "linewidth": 2})

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 
@@ -155,7 +156,8 @@ def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
         saved.places.add(view)  # both are in one world
         remember(saved)
         saved.save(tmp_path / f"{name}.npz")
-    found, shown = ask(tmp_path / "today.npz", "changes", "--since", tmp_path / "yesterday.npz")
+    since = ("changes", "--since", tmp_path / "yesterday.npz", "--picture", tmp_path / "changes.png")
+    found, shown = ask(tmp_path / "today.npz", *since)
     (change,) = found["changes"]
     assert (found["since_ns"], change["kind"], change["class"], change["before"]["room"]) == (10, "moved", "table", 1)
     np.testing.assert_allclose(change["before"]["box"]["center"], (0.55, 0.55, 0.2), atol=0.08)
@@ -165,6 +167,11 @@ def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
     assert kept is not None and "moved" in shown and "room" in shown
     np.testing.assert_allclose(kept.box.center, change["before"]["box"]["center"], atol=1e-4)
     assert "not later" in refused("query", tmp_path / "yesterday.npz", "changes", "--since", tmp_path / "today.npz")
+    picture = cv2.cvtColor(cv2.imread(str(tmp_path / "changes.png")), cv2.COLOR_BGR2RGB).astype(int)
+    drawn = (
+        np.abs(picture - (255, 210, 31)).max(axis=2) < 8
+    )  # yellow: a box in each half, and an arrow in the right one
+    assert drawn[100:, :780].sum() > 50 and drawn[100:, 820:].sum() > drawn[100:, :780].sum() + 50
     assert "--since MAP" in refused("query", tmp_path / "today.npz", "changes")
     said = refused("query", tmp_path / "today.npz", "info", "--since", tmp_path / "today.npz", code=2)
     assert "goes with `changes`" in said
