@@ -37,7 +37,7 @@ class MapNow(NamedTuple):
 
 def read_live(client: MapClient) -> MapNow:
     """The map of a running mapper. Raises as ``MapClient.objects`` does."""
-    remembered = client.objects(up := client.up())
+    remembered, up = client.objects(), client.up()
     changes = changes_of(remembered.objects, remembered.since_ns)
     return MapNow(client.mirror().snapshot(), remembered.objects, up, remembered.since_ns, changes)
 
@@ -80,9 +80,9 @@ class MapTools:
         wanted = room.casefold().removeprefix("the ").removeprefix("room").strip()
         if not wanted:
             return {"rooms": [_room(number, kinds[number], objects) for number in sorted(kinds)]}
-        number = int(wanted) if wanted.isdigit() else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
+        number = int(wanted) if wanted.isdecimal() else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
         likeliest = {n: max(kind, key=kind.__getitem__) for n, kind in sorted(kinds.items())}
-        if number not in kinds or not (wanted.isdigit() or likeliest[number] == wanted):
+        if number not in kinds or not (wanted.isdecimal() or likeliest[number] == wanted):
             names = [f"{n} ({kind or 'of no kind'})" for n, kind in likeliest.items()]
             raise MapError(f"no room '{room}' is known; rooms are {', '.join(names) or 'not known at all'}")
         things = [
@@ -108,7 +108,10 @@ class MapTools:
         places = [np.array(p or (), np.float64) for p in (eye, target)]
         if any(p.shape != (3,) for p in places):
             raise MapError("look: give a phrase, or eye and target, [x, y, z] each")
-        return render(now.snapshot, look_at(places[0], places[1], now.up), WIDTH)
+        forward = places[1] - places[0]
+        along_up = np.linalg.norm(np.cross(forward, now.up)) <= 1e-3 * np.linalg.norm(forward)
+        up = np.eye(3)[np.abs(now.up).argmin()] if along_up else now.up  # from above: any side
+        return render(now.snapshot, look_at(places[0], places[1], up), WIDTH)
 
 
 def serve(read: Callable[[], MapNow]) -> None:

@@ -148,7 +148,7 @@ class MapClient(Closing):
         computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of synonyms.
         See ``queries.find``."""
         axis = self.up() if up is None else up
-        objects = self.objects(axis).objects
+        objects = self.objects(up).objects
         return find(phrase, self.mirror().snapshot(), objects, up=axis, limit=limit, encoder=encoder)
 
     def up(self) -> Float64:

@@ -29,7 +29,6 @@ from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
-from semantic_mapper.queries.checks import check_up
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
@@ -38,7 +37,7 @@ from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import Request, encode_error
 from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
-from semantic_mapper.queries.surface import cast_rays, points_in_box, up_in
+from semantic_mapper.queries.surface import cast_rays, points_in_box
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.keys import Keys
 from semantic_mapper.transport.sockets import QueryServer
@@ -48,6 +47,7 @@ MAX_BLOCKS = 600  # copied between two frames, and the rest of a frame: bounds w
 LISTENED_S = 1.0  # without a question for so long, no more snapshots are made
 CATCH_UP_S = 4.0  # without another copy for so long, questions wait no longer for the present map
 MAX_WAITING, MAX_OF_CLIENT = 64, 8  # questions that wait, of all clients and of one
+MAX_UPS = 4  # directions up, by which rooms are kept
 # What would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
@@ -107,8 +107,11 @@ class QueryService(Closing):
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         self._tracker = InstanceTracker()
-        self._before, self._graph = before, GraphTracker()
-        self._remembered: tuple[int, questions.RememberedObjects] | None = None  # with the version of the map
+        self._before = before
+        self._graphs: dict[questions.Point | None, GraphTracker] = {}  # by ``up``
+        self._remembered: tuple[object, questions.RememberedObjects] | None = (
+            None  # with the version of the map, and up
+        )
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
@@ -309,17 +312,21 @@ class QueryService(Closing):
 
     def _remember(self, snapshot: MapSnapshot, request: questions.ObjectsRequest) -> questions.RememberedObjects:
         """What the map remembers, with what is there now; costs nothing while the map is the same."""
-        if self._remembered is None or self._remembered[0] != snapshot.version:
+        key = (snapshot.version, request.up)
+        if self._remembered is None or self._remembered[0] != key:
             memory, before = ObjectMemory.from_bytes(self._map.objects), self._before
-            up = up_in(snapshot) if request.up is None else check_up(request.up)
+            if request.up not in self._graphs and len(self._graphs) == MAX_UPS:
+                self._graphs.clear()
+            tracker = self._graphs.setdefault(request.up, GraphTracker(request.up))
+            up = tracker.up_in(snapshot)
             things = tuple(thing for thing in self._tracker.find(snapshot, up).things if not thing.unsure)
-            graph = self._graph.update(snapshot, things)
+            graph = tracker.update(snapshot, things)
             looks = Looks.of(self._map.places.places, memory.last_ns)
             now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns)
             memory.update(now, up, graph.room_of, before)
             self._map.objects = memory.to_bytes()
             since_ns = 0 if before is None else before.stamp_ns
-            self._remembered = snapshot.version, questions.RememberedObjects(memory.objects, since_ns)
+            self._remembered = key, questions.RememberedObjects(memory.objects, since_ns)
         return self._remembered[1]
 
 

@@ -33,6 +33,7 @@ from semantic_mapper.types import Float64, UInt8
 LEAST_PROBABILITY = 0.005  # of an answer
 COLOR_LIGHTNESS, COLOR_SPREAD = 0.7, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
 LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
+SHADE_SPREAD = 8.0  # CIELAB lightness
 SIZE_SPREAD = 0.12  # logarithm of a ratio of lengths
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
 ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
@@ -127,6 +128,9 @@ class _Scene:
         if noun.colors:
             names = color_names(_lab(thing.color) * self._gain)
             parts["color"] = max(names[name] for name in noun.colors)
+            if noun.shade:
+                usual = np.mean([_colors()[name][:, 0].mean() for name in noun.colors])
+                parts["shade"] = _soft(noun.shade * (_lab(thing.color)[0] * self._gain - usual) / SHADE_SPREAD)
         for what, sign in noun.sizes:
             median = self._medians.get(thing.class_id)
             k = ("size", "height", "length").index(what)

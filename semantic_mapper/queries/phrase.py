@@ -25,6 +25,7 @@ RELATIONS: Mapping[str, str] = _WORDS["relations"]
 OTHER_WEIGHT = 0.15  # of a class of many kinds of things, for a word that means one of them
 _COLORS = {w: name for name, words in _WORDS["color_synonyms"].items() for w in words.split()} | {c: c for c in COLORS}
 _SIZES = {w: (key.strip("-"), -1 if key[0] == "-" else 1) for key, ws in _WORDS["sizes"].items() for w in ws.split()}
+_SHADES = {word: 1 if name == "light" else -1 for name, words in _WORDS["shades"].items() for word in words.split()}
 _KINDS = {name.replace(" ", ""): name for name in ROOM_KINDS}
 _KINDS |= {word: name for name, words in _WORDS["room_synonyms"].items() for word in words.split()}
 _RELATIONS = {word: name for name, words in RELATIONS.items() for word in words.split("|")}
@@ -50,6 +51,7 @@ class NounPhrase:
     classes: Mapping[int, float]  # class id -> how well the words mean it, above 0, at most 1
     colors: tuple[str, ...] = ()  # of ``COLORS``
     sizes: tuple[tuple[str, int], ...] = ()  # "size", "height" or "length"; 1 = more of it than usual, -1 = less
+    shade: int = 0  # of the colours: 1 = light, -1 = dark, 0 = any
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +107,14 @@ def _read_noun(
     words: list[str], labels: LabelSet, nouns: Mapping[str, Mapping[int, float]], encoder: TextEncoder | None
 ) -> NounPhrase:
     text, found = " ".join(words), list[str]()
-    colors, sizes = list[str](), list[tuple[str, int]]()
+    colors, sizes, shade = list[str](), list[tuple[str, int]](), 0
     while words:
         joined = [("".join(words[:n]), n) for n in (3, 2, 1) if n <= len(words)]
         word, n = next((j for j in joined if _folded(j[0]) in nouns), joined[-1]) if encoder is None else joined[-1]
         words = words[n:]
-        if word in _COLORS:
+        if word in _SHADES and words and words[0] in _COLORS:  # "light" alone is a thing
+            shade = _SHADES[word]
+        elif word in _COLORS:
             colors.append(_COLORS[word])
         elif word in _SIZES:
             sizes.append(_SIZES[word])
@@ -129,7 +133,7 @@ def _read_noun(
         raise MapError(f"find: '{found[0]}' and '{found[1]}' are two things; say how they lie: {', '.join(RELATIONS)}")
     else:
         classes = nouns[_folded(found[0])]
-    return NounPhrase(text, classes, tuple(colors), tuple(sizes))
+    return NounPhrase(text, classes, tuple(colors), tuple(sizes), shade)
 
 
 def _folded(word: str) -> str:
@@ -177,7 +181,7 @@ def _moment(found: re.Match[str], now_ns: int) -> tuple[int, int]:
         hour, _, minute = re.sub(r" ?[ap]m", "", {"noon": "12", "midnight": "0"}.get(clock, clock)).partition(":")
         half = 12 * (clock.endswith("pm") - (clock[-1] == "m" and hour == "12"))
         at = at.replace(hour=int(hour) + half, minute=int(minute or 0))
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise MapError(f"find: '{found[0].strip()}' is no time: {error}") from error
     return _stamp(at), _stamp(at + timedelta(minutes=1))
 

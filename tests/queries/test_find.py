@@ -73,6 +73,7 @@ def names(classes: Any, labels: Any = THINGS) -> set[str]:
     [
         ("Where is my couch?", {"sofa"}, ((), (), [], ())),
         ("the big, red chairs", {"chair"}, (("red",), (("size", 1),), [], ())),
+        ("a light blue sofa", {"sofa"}, (("blue",), (), [], ())),
         ("a grey fridge in the kitchen", {"refrigerator"}, (("gray",), (), [], ("kitchen",))),
         ("something in room 3 next to a blue sofa", set(THINGS.names), ((), (), [("near", "sofa")], (3,))),
         ("other object on top of the coffee table", {"otherprop"}, ((), (), [("on", "table")], ())),
@@ -118,12 +119,20 @@ def test_times_are_local_and_of_the_day_of_the_map(text: str, after: int | None,
         ("", "names no thing"),
         ("chair not in the kitchen", "'not' cannot be answered"),
         ("chair seen after 25:00", "is no time"),
+        ("chair seen on 9999-12-31", "is no time"),
+        ("the dark chair", "'dark' is not known"),
         ("chair in the garage", "'garage' is not known"),
     ],
 )
 def test_what_is_not_understood_is_said(text: str, said: str) -> None:
     with pytest.raises(MapError, match=said):
         read_phrase(text, THINGS, at(18))
+
+
+def test_a_shade_tells_two_things_of_one_color_apart() -> None:
+    things = [thing(n, "chair", (n, 1, 0.5), (0.5, 0.5, 0.9), rgb=rgb) for n, rgb in ((1, BLUE), (2, (144, 184, 224)))]
+    things.append(thing(3, "refrigerator", (4, 2, 1), (0.6, 0.6, 1.8), rgb=WHITE))
+    assert [ids(f"{shade} blue chair", things)[0] for shade in ("dark", "light", "pale")] == [1, 2, 2]
 
 
 def test_a_stamp_that_is_no_date_has_no_noon() -> None:

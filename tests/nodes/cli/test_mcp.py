@@ -63,15 +63,17 @@ def test_an_agent_finds_things_goals_and_pictures_in_a_saved_map(tmp_path: Path)
         ("what_changed", {}),
         ("look", {"phrase": "table"}),
         ("look", {"eye": [3.6, 1.5, 1.2], "target": [5.0, 0.9, 0.5]}),
+        ("look", {"eye": [5.0, 0.9, 2.0], "target": [5.0, 0.9, 0.5]}),
         ("find", {"phrase": "tabel"}),
         ("goal_near", {"phrase": "door"}),
         ("describe_room", {"room": "garage"}),
+        ("describe_room", {"room": "²"}),
         ("look", {"eye": [1.0]}),
     ]
     tools, found = call(calls, tmp_path / "today.npz", "--since", tmp_path / "yesterday.npz")
     assert {tool.name for tool in tools} == {name for name, _ in calls}
     assert all(tool.annotations.read_only_hint and len(tool.description) > 40 for tool in tools)
-    rooms, east, small, goal, changes, picture, view, *errors = found
+    rooms, east, small, goal, changes, picture, view, above, *errors = found
     assert [(room["id"], room["counts"]) for room in rooms["rooms"]] == [(2, {"table": 2})]
     np.testing.assert_allclose(sorted(thing["size"][2] for thing in east["things"]), (0.4, 0.7), atol=0.08)
     (answer,) = small["answers"]
@@ -81,10 +83,10 @@ def test_an_agent_finds_things_goals_and_pictures_in_a_saved_map(tmp_path: Path)
     to = np.array(goal["thing"]["box"]["center"])[:2] - goal["position"][:2]
     assert abs(goal["position"][2]) < 0.06 and to @ goal["forward"][:2] > 0.99 * np.linalg.norm(to) > 0.5
     assert [(c["kind"], c["id"]) for c in changes["changes"]] == [("moved", answer["id"])]
-    for content in (picture, view):
+    for content in (picture, view, above):
         data = np.frombuffer(base64.b64decode(content.data), np.uint8)
         assert cv2.imdecode(data, cv2.IMREAD_COLOR).shape == (480, 640, 3) and content.mime_type == "image/png"
-    said = ("did you mean table", "nothing in the map fits 'door'", "rooms are 2", "eye and target")
+    said = ("did you mean table", "nothing in the map fits 'door'", "rooms are 2", "rooms are 2", "eye and target")
     for text, error in zip(said, errors, strict=True):
         assert text in error.text
 
