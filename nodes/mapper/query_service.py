@@ -109,9 +109,7 @@ class QueryService(Closing):
         self._tracker = InstanceTracker()
         self._before = before
         self._graphs: dict[questions.Point | None, GraphTracker] = {}  # by ``up``
-        self._remembered: tuple[object, questions.RememberedObjects] | None = (
-            None  # with the version of the map, and up
-        )
+        self._remembered: tuple[object, questions.RememberedObjects] | None = None  # by version of the map and up
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
@@ -322,9 +320,10 @@ class QueryService(Closing):
             things = tuple(thing for thing in self._tracker.find(snapshot, up).things if not thing.unsure)
             graph = tracker.update(snapshot, things)
             looks = Looks.of(self._map.places.places, memory.last_ns)
-            now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns)
+            changed = snapshot.packed[snapshot.versions > self._map.objects_version] if len(memory) else None
+            now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns, changed)
             memory.update(now, up, graph.room_of, before)
-            self._map.objects = memory.to_bytes()
+            self._map.objects, self._map.objects_version = memory.to_bytes(), snapshot.version
             since_ns = 0 if before is None else before.stamp_ns
             self._remembered = key, questions.RememberedObjects(memory.objects, since_ns)
         return self._remembered[1]

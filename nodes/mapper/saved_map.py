@@ -143,6 +143,7 @@ def continue_map(voxel_map: VoxelMap, saved: VoxelMap, name: str) -> None:
         return
     try:
         voxel_map.take_over(saved)
+        voxel_map.objects_version = voxel_map.version
     except MapError as error:
         raise ConfigError(
             f"{name}: its classes are {saved.label_set.name} ({len(saved.label_set)}), those of the weights "

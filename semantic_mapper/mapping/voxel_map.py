@@ -81,6 +81,7 @@ class VoxelMap:
         self.refined = ""
         self.places = PlaceStore()
         self.objects = b""
+        self.objects_version = 0  # ``version`` that ``objects`` are of
         self.cleared = 0
         self._cleared_rows = NONE_CLEARED
         self._bounds = NO_BOUNDS  # of the last frame that cleared
@@ -215,6 +216,11 @@ class VoxelMap:
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
+    def changed_keys(self, since: int) -> Int64:
+        """Packed keys (B,) of the blocks that have changed after a version, sorted."""
+        with _KERNEL_LOCK:
+            return self._grid.versions_since(since)[0]
+
     def points(self, min_weight: float = SURFACE_WEIGHT, *, unknown_below: float | None = None) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order; 1 as ``min_weight`` = only what was
         measured. ``unknown_below`` instead of the setting."""
@@ -343,7 +349,7 @@ class VoxelMap:
         self.note_scale(manifest.scale_known)
         self.refined = manifest.refined
         self.places = PlaceStore(places)
-        self.objects = objects
+        self.objects, self.objects_version = objects, self.version
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
         """A new map of what both have measured, in this map's frame and with its settings; see ``add``."""

@@ -95,14 +95,15 @@ def find(
 
 
 def open_objects(path: Path) -> tuple[MapSnapshot, tuple[MapObject, ...]]:
-    """A saved map, and the objects that it remembers, or has now where it remembers none.
+    """A saved map, and the objects that it remembers; brought up to the present where what it remembers is older.
 
     Raises MapError: as of ``VoxelMap.load``; no metres, or no floor."""
     with open_map(path) as reader:
-        data = reader.objects()
-    if data:
-        return MapMirror.load(path).snapshot(), ObjectMemory.from_bytes(data).objects
+        memory, stamp_ns = ObjectMemory.from_bytes(reader.objects()), reader.manifest.last_stamp_ns
+    if len(memory) and memory.last_ns >= stamp_ns:
+        return MapMirror.load(path).snapshot(), memory.objects
     voxel_map = VoxelMap.load(path)
+    voxel_map.objects_version = 0  # when it changed is not in the file
     if remember(voxel_map) is None:
         raise MapError(f"{path}: things are found where lengths are metres and a floor was seen, which is not so here")
     return MapMirror.of(voxel_map).snapshot(), ObjectMemory.from_bytes(voxel_map.objects).objects

@@ -51,6 +51,7 @@ MAX_PLACES = 4  # that an object keeps of its history
 MAX_CLASSES = 4  # that an object keeps the probabilities of
 POINTS = 96  # of its surface that an object keeps, at most
 MAX_BYTES = 50 << 20  # of a memory in a file, unpacked
+NEVER_NS = -(2**63)
 MEMORY_VIEWS = 9  # that the probabilities of classes are averaged over, at most
 
 Kind = Literal["moved", "new", "gone"]
@@ -79,7 +80,7 @@ class MapObject:
     signature: NDArray[np.int8] = field(repr=False)  # (SIGNATURE,) int8, what it looks like; see ``signature_of``
     points: NDArray[np.int16] = field(repr=False)  # (N, 3) int16 of its surface, millimetres from the box's centre
     first_seen_ns: int
-    last_seen_ns: int
+    last_seen_ns: int  # stamp of the last update before which a part of it was seen again
     views: int  # updates of the memory in which it was seen
     room: int | None  # where it is, or was last
     places: tuple[ObjectPlace, ...]  # where it was, the oldest first; the last is the present one
@@ -119,6 +120,7 @@ class ObjectChange:
 class _Rows(msgspec.Struct, frozen=True, array_like=True):
     next_id: Annotated[int, msgspec.Meta(ge=1)]
     objects: Annotated[tuple[MapObject, ...], msgspec.Meta(max_length=MAX_OBJECTS)]
+    last_ns: int = NEVER_NS
 
 
 class ObjectMemory:
@@ -127,13 +129,14 @@ class ObjectMemory:
     Beyond ``MAX_OBJECTS`` those that went first are forgotten, then those seen least. Raises MapError: an id that comes
     twice."""
 
-    def __init__(self, objects: Iterable[MapObject] = (), next_id: int = 1) -> None:
+    def __init__(self, objects: Iterable[MapObject] = (), next_id: int = 1, last_ns: int = NEVER_NS) -> None:
         self._objects: dict[int, MapObject] = {}
         for thing in objects:
             if thing.id in self._objects:
                 raise MapError(f"object memory: id {thing.id} comes twice")
             self._objects[thing.id] = thing
         self._next_id = max((next_id, *(number + 1 for number in self._objects)))
+        self._last_ns = last_ns
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -202,7 +205,7 @@ class ObjectMemory:
             moved = _refreshed(thing, now, j, up, rooms)
             place = ObjectPlace(stamp_ns, moved.box, moved.room)
             places = (*thing.places, place)[-MAX_PLACES:]
-            moved = replace(moved, places=places, missed=0, gone_ns=None, certainty=probability)
+            moved = replace(moved, places=places, missed=0, gone_ns=None, certainty=probability, last_seen_ns=stamp_ns)
             self._objects[thing.id] = moved
             left.add(thing.id)
             came.add(j)
@@ -225,6 +228,7 @@ class ObjectMemory:
             if old[i].id in self._objects and old[i].id not in left and j not in came:
                 self._objects[old[i].id] = _refreshed(old[i], now, j, up, rooms)
                 came.add(j)
+        self._last_ns = max(self._last_ns, stamp_ns)
         for j in range(len(now.things)):
             if j not in came:
                 appeared = before is not None and j in comers and comers[j].free >= GONE_FREE
@@ -284,12 +288,14 @@ class ObjectMemory:
 
     @property
     def last_ns(self) -> int:
-        """Stamp of the last update that saw something; the least stamp of an empty memory."""
-        return max((thing.last_seen_ns for thing in self._objects.values()), default=-(2**63))
+        """Stamp of the last update; the least stamp of an empty memory."""
+        return max((self._last_ns, *(thing.last_seen_ns for thing in self._objects.values())))
 
     def moved_by(self, T_new_old: Float64) -> ObjectMemory:
         """The same objects where the world is another one, at ``T_new_old`` (4, 4)."""
-        return ObjectMemory((_moved_by(thing, T_new_old) for thing in self._objects.values()), self._next_id)
+        return ObjectMemory(
+            (_moved_by(thing, T_new_old) for thing in self._objects.values()), self._next_id, self._last_ns
+        )
 
     def join(self, other: ObjectMemory) -> None:
         """Take over the objects of another map of the same world. What is there in both, at one place and of one class,
@@ -318,7 +324,7 @@ class ObjectMemory:
 
     def to_bytes(self) -> bytes:
         """For a file; see ``from_bytes``."""
-        content = msgspec.msgpack.encode(_Rows(self._next_id, self.objects), enc_hook=_pack)
+        content = msgspec.msgpack.encode(_Rows(self._next_id, self.objects, self._last_ns), enc_hook=_pack)
         return struct.pack("<I", len(content)) + zstd_compress(content)
 
     @classmethod
@@ -337,7 +343,7 @@ class ObjectMemory:
             raise MapError(f"object memory is damaged: {error}") from error
         if not whole:
             raise MapError("object memory is damaged: of an object its id, classes, places or looks are missing")
-        return cls(rows.objects, rows.next_id)
+        return cls(rows.objects, rows.next_id, rows.last_ns)
 
     def _forget(self) -> None:
         excess = len(self._objects) - MAX_OBJECTS
@@ -380,10 +386,11 @@ def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph 
         graph = tracker.update(snapshot)
     except MapError:
         return None
-    stamp_ns = voxel_map.last_stamp_ns
     looks = Looks.of(voxel_map.places.places, memory.last_ns)
-    memory.update(MapVisit(snapshot, graph.things, looks, stamp_ns), graph.up, graph.room_of, before)
-    voxel_map.objects = memory.to_bytes()
+    changed = voxel_map.changed_keys(voxel_map.objects_version) if len(memory) else None
+    now = MapVisit(snapshot, graph.things, looks, voxel_map.last_stamp_ns, changed)
+    memory.update(now, graph.up, graph.room_of, before)
+    voxel_map.objects, voxel_map.objects_version = memory.to_bytes(), snapshot.version
     return graph
 
 
@@ -424,7 +431,7 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[ObjectChange, ...]
         aligned = VoxelMap(now.config, now.label_set)
         aligned.add(before, T)
         before, theirs = aligned, theirs.moved_by(T)
-    now.objects = theirs.to_bytes()
+    now.objects, now.objects_version = theirs.to_bytes(), 0
     require_metres(now.scale_known, "changes")
     if remember(now, visit_of(before)) is None:
         raise MapError("changes: no floor was found, by which it is known which way is up")
@@ -474,6 +481,7 @@ def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mappin
     names = {old.class_id: old.class_name, made.class_id: made.class_name}
     labels = now.snapshot.label_set
     best = made if made.seen >= old.seen else old
+    is_seen = now.sees(now.things[j])
     place = ObjectPlace(old.places[-1].stamp_ns, made.box, made.room)
     return replace(
         made,
@@ -483,7 +491,8 @@ def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mappin
         signature=best.signature,
         color=best.color,
         first_seen_ns=old.first_seen_ns,
-        views=old.views + 1,
+        last_seen_ns=made.last_seen_ns if is_seen else old.last_seen_ns,
+        views=old.views + is_seen,
         places=(*old.places[:-1], place),
         appeared=old.appeared,
         certainty=old.certainty,

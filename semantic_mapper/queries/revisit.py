@@ -112,12 +112,21 @@ class Looks:
 
 
 class MapVisit(NamedTuple):
-    """A state of a map, its things, the views that it comes of, and the stamp of the last frame."""
+    """A state of a map, its things, the views that it comes of, the stamp of the last frame, and packed keys (B,) of
+    blocks that have changed since the last update of the memory (None = all)."""
 
     snapshot: MapSnapshot
     things: Sequence[Instance]
     looks: Looks
     stamp_ns: int
+    changed: Int64 | None = None
+
+    def sees(self, thing: Instance) -> bool:
+        """Whether enough of a thing was seen since."""
+        if self.changed is None:
+            return True
+        keys = np.unique(pack_keys(thing.voxels >> 3))
+        return bool(np.isin(keys, self.changed).mean() >= LEAST_KNOWN)
 
 
 class Evidence(NamedTuple):

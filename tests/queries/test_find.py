@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from semantic_mapper.labels import CAMVID11, NYU40, PROVIDED, ROOMS, make_label_
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.find import find, open_objects, picture_of, room_kinds
 from semantic_mapper.queries.instances import OrientedBox
-from semantic_mapper.queries.objects import MapObject, ObjectPlace
+from semantic_mapper.queries.objects import MapObject, ObjectMemory, ObjectPlace
 from semantic_mapper.queries.phrase import SYNONYMS, read_phrase
 from semantic_mapper.queries.revisit import SIGNATURE
 from semantic_mapper.queries.snapshot import MapMirror
@@ -127,6 +128,22 @@ def test_times_are_local_and_of_the_day_of_the_map(text: str, after: int | None,
 def test_what_is_not_understood_is_said(text: str, said: str) -> None:
     with pytest.raises(MapError, match=said):
         read_phrase(text, THINGS, at(18))
+
+
+def test_a_memory_older_than_its_map_is_brought_up_to_the_present(tmp_path: Path) -> None:
+    made = VoxelMap.received(house_changes(two_rooms(), 0), VOXEL_M, LABELS)
+    made.last_stamp_ns, made.objects = (
+        20,
+        ObjectMemory([thing(7, "table", (0.5, 2.5, 0.4), (0.4, 0.4, 0.8))]).to_bytes(),
+    )
+    made.save(tmp_path / "map.npz")
+    _, objects = open_objects(tmp_path / "map.npz")
+    assert len(objects) == 1
+    old = replace(thing(7, "table", (0.5, 2.5, 0.4), (0.4, 0.4, 0.8)), last_seen_ns=10)
+    made.objects = ObjectMemory([old]).to_bytes()
+    made.save(tmp_path / "map.npz")
+    _, objects = open_objects(tmp_path / "map.npz")
+    assert [o.id for o in objects] == [7, 8]
 
 
 def test_a_shade_tells_two_things_of_one_color_apart() -> None:

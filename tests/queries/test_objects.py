@@ -15,6 +15,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import invert_pose, yaw_transform
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
+from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.objects import (
@@ -77,6 +78,33 @@ def test_what_was_moved_came_and_went_is_told_apart() -> None:
     assert bench.present < 0.4 and chest.present == 1 and replace(chest, missed=3).present == 0.25
     (table,) = [o for o in memory.there if np.linalg.norm(o.box.center - TABLE) < 0.1]
     assert table.views == 2 and len(table.places) == 1 and memory.get(table.id) is table
+
+
+def test_what_no_view_met_again_was_last_seen_before() -> None:
+    memory, house = ObjectMemory(), [*two_rooms(), box(CHEST, 0.3, 0.3)]
+    memory.update(visit(house, 10), UP)
+    later = visit(house, 20)
+    east = later.snapshot.packed[unpack_keys(later.snapshot.packed)[:, 0] * 8 * VOXEL_M > 3.5]
+    memory.update(later._replace(changed=east), UP)
+    table, chest = sorted(memory.there, key=lambda o: -o.box.center[0])
+    assert [(o.last_seen_ns, o.views) for o in (table, chest)] == [(20, 2), (10, 1)]
+    loaded = ObjectMemory.from_bytes(memory.to_bytes())
+    assert loaded.last_ns == memory.last_ns == 20
+
+
+def test_a_map_that_goes_on_elsewhere_says_when_a_thing_was_last_seen() -> None:
+    made = VoxelMap.received(house_changes(two_rooms(), 0), VOXEL_M, LABELS)
+    made.last_stamp_ns = 10
+    assert remember(made) is not None
+    made.last_stamp_ns = 20
+    assert remember(made) is not None
+    (table,) = ObjectMemory.from_bytes(made.objects).there
+    assert (table.last_seen_ns, table.views) == (10, 1)
+    for _ in made.changing(made.changed_keys(0)):
+        pass
+    assert remember(made) is not None
+    (table,) = ObjectMemory.from_bytes(made.objects).there
+    assert (table.last_seen_ns, table.views) == (20, 2)
 
 
 def test_what_was_brought_back_is_what_was_taken_away() -> None:
