@@ -299,11 +299,16 @@ def render(snapshot: MapSnapshot, T_world_camera: Float64, width: int = 320, fov
 
 
 def picture_of(snapshot: MapSnapshot, found: FoundObject, up: Float64, width: int = 320) -> UInt8:
-    """A crop (H, W, 3) uint8 round an object, seen from where ``found`` says, or from above its side."""
+    """A crop (H, W, 3) uint8 round an object, seen from where ``found`` says, or from above the side that was seen."""
     box = found.object.box
     size = float(np.linalg.norm(box.size))
     T = found.T_world_camera
     if T is None:
-        T = look_at(box.center + (size + 0.5) * (box.R_world_box[:, 1] + 0.7 * up), box.center, up)
+        angle = np.linspace(0, 2 * np.pi, VIEW_DIRECTIONS, endpoint=False)[:, None]
+        ways = np.sin(angle) * box.R_world_box[:, 0] + np.cos(angle) * box.R_world_box[:, 1] + 0.7 * up
+        before = found.object.surface / snapshot.voxel_size_m + 3 * ways[:, None] / np.linalg.norm(ways[0])
+        free = read_states(before.reshape(-1, 3), snapshot).reshape(len(ways), -1) == State.FREE
+        way = ways[free.sum(axis=1).argmax()]  # the side that was seen
+        T = look_at(box.center + (size + 0.5) * way, box.center, up)
     distance = float(np.linalg.norm(T[:3, 3] - box.center))
     return render(snapshot, T, width, 2 * float(np.arctan(0.8 * size / distance)))
