@@ -18,7 +18,7 @@ from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, fetch, is_store, is_url
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.queries.objects import ObjectMemory
+from semantic_mapper.queries.objects import ObjectMemory, remember
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX, map_path
 from semantic_mapper.types import Float64
 
@@ -73,8 +73,11 @@ def merge_maps(
                             f"{found.agreeing} of {found.looked_for} places found in the maps before it; at "
                             f"({where[0]:.2f}, {where[1]:.2f}, {where[2]:.2f}), turned by {turn:.1f} degrees"
                         )
+                    if not loaded.objects:
+                        remember(loaded)
+                    objects = ObjectMemory.from_bytes(loaded.objects)
                     whole.add(loaded, T_world_map)
-                    memory.join(ObjectMemory.from_bytes(loaded.objects).moved_by(T_world_map))
+                    memory.join(objects.moved_by(T_world_map))
                 except MapError as error:
                     refused[name] = str(error)
                     continue

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from semantic_mapper.config import SegmenterConfig
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
 from semantic_mapper.evaluation.panoptic import PanopticImage
@@ -93,11 +94,12 @@ class _Scores:
 
 
 def field_predictors(mapper: Mapper) -> dict[str, Predictor]:
-    """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
-    encoder says of the frame alone, where it has an opinion of single images."""
+    """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one, and no segmenter
+    sees it), and what its encoder says of the frame alone, where it has an opinion of single images."""
     config, model = mapper.pipeline.config, mapper.model
     keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
-    novel = msgspec.structs.replace(config, keyframes=keyframes)
+    moving = msgspec.structs.replace(config.moving, classes=config.moving.classes and not config.segmenter.table)
+    novel = msgspec.structs.replace(config, keyframes=keyframes, segmenter=SegmenterConfig(), moving=moving)
     pipeline = MappingPipeline(
         novel, make_field(mapper.weights, novel), mapper.pipeline.label_set, anchors=mapper.weights.anchors
     )

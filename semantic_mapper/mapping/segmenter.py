@@ -17,6 +17,7 @@ surface that the answer was about; elsewhere nothing is known.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -25,16 +26,17 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.config import Config, Fraction, Positive, SegmenterConfig, load_config, nearest, nearest_path
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.inference import compile_request, core
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import FrameViews
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.labels import PROVIDED, LabelSet
 from semantic_mapper.mapping.rendering import RenderedView
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, UInt8
 
 STEP = 32  # pixels by which the sides of pictures differ, where the model takes any: networks halve five times
 MARGIN_M, MARGIN_PER_M = 0.05, 0.02  # between depth of two frames that is one surface
+ROUNDING = 1e-3  # by which probabilities of a pixel may miss a sum of 1
 MOVES = 0.5  # probability of classes that move from which on a pixel is one of them
 MOST_CLASSES = 4096
 
@@ -106,6 +108,9 @@ class Segmenter:
         self._every = config.every_n_frames
         self._model = _Model(path.parent / table.model, table, str(path))
         used = {k: label_set.names.index(n) for k, n in table.names.items() if n in label_set.names}
+        known = {name for labels in PROVIDED.values() for name in labels.names} | set(label_set.names)
+        if wrong := sorted(set(table.names.values()) - known):
+            raise ConfigError(f"{path}: names: no label set has '{wrong[0]}'{nearest(wrong[0], sorted(known))}")
         if not used and not table.moving:
             raise ConfigError(
                 f"{path}: names: none of the classes of '{label_set.name}' is among them: "
@@ -118,8 +123,8 @@ class Segmenter:
         self._moving = np.array([name in table.moving for name in table.classes], np.float32)
         self._use(table)
         self.moves = bool(self._moving.any())
-        self._count = 0
-        self._last: _Answer | None = None
+        self._counts = Counter[str]()  # frames seen, by camera
+        self._last: dict[str, _Answer] = {}
 
     def _use(self, table: SegmenterTable) -> None:
         likelihoods = _likelihoods(self._answers, self._groups, table.miss, table.false_alarm)
@@ -127,13 +132,17 @@ class Segmenter:
 
     def look(self, views: FrameViews, coarse: CameraIntrinsics) -> Opinion:
         """What the model says of a frame at ``coarse`` pixels (h, w), or said of one before."""
-        if self._count % self._every == 0:
-            values = self._ask(views.frame.rgb, (coarse.height, coarse.width))
-            self._last = _Answer(values, views.depth(coarse), coarse, views.frame.T_world_camera)
+        frame, camera = views.frame, views.frame.camera_id
+        if self._counts[camera] % self._every == 0:
+            values = self._ask(frame.rgb, (coarse.height, coarse.width))
+            if not np.isfinite(values).all():
+                raise FrameError(
+                    f"frame seq={frame.seq}: the segmenter's model gives values that are no numbers for it"
+                )
+            self._last[camera] = _Answer(values, views.depth(coarse), coarse, frame.T_world_camera)
         else:
-            assert self._last is not None
-            values = _carried(self._last, views.depth(coarse), coarse, views.frame.T_world_camera)
-        self._count += 1
+            values = _carried(self._last[camera], views.depth(coarse), coarse, frame.T_world_camera)
+        self._counts[camera] += 1
         return Opinion(values[..., :-1], self._group, values[..., -1] >= MOVES)
 
     def _ask(self, rgb: UInt8, size: tuple[int, int]) -> Float32:
@@ -191,6 +200,25 @@ class _Model:
                 "`classes`, of one picture of three channels"
             )
         self._requests: dict[tuple[int, int], Any] = {}
+        self._try(table, where)
+
+    def _try(self, table: SegmenterTable, where: str) -> None:
+        """Show it a grey picture as wide as a camera's."""
+        picture = np.zeros((*self.input_size(480, 640, table.width), 3), np.float32)
+        try:
+            values = self.run(picture)
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1][:300]
+            raise ConfigError(
+                f"{where}: model: it takes no picture of {picture.shape[1]}x{picture.shape[0]} ({reason}); export it "
+                "for one size, or for any"
+            ) from error
+        sums = bool(values.min() >= -ROUNDING and np.abs(values.sum(axis=2) - 1).max() <= ROUNDING)
+        if sums != (table.output == "probabilities"):
+            raise ConfigError(
+                f'{where}: output: "{table.output}", but values of a pixel {"sum" if sums else "do not sum"} to 1; say '
+                f'"{"probabilities" if sums else "logits"}"'
+            )
 
     def input_size(self, height: int, width: int, longer: int) -> tuple[int, int]:
         """Height and width of the picture that is put in, for an image of a size."""

@@ -140,12 +140,23 @@ def test_it_joins_labels_and_map_and_what_moves_is_left_out(tmp_path: Path):
         ('moving = ["walker"]', 'moving = ["walkre"]', "has no class 'walkre'; did you mean `walker`"),
         ("width = 96", 'width = 96\nsha256 = "00"', "sha256 is not that of"),
         ("width = 96", "size = 96", "unknown key `size`"),
+        ("width = 96", 'width = 96\noutput = "probabilities"', 'do not sum to 1; say "logits"'),
+        ('seat = "chair"', 'seat = "chiar"', "no label set has 'chiar'; did you mean `chair`"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_said(tmp_path: Path, old: str, new: str, message: str):
     path = write_model(tmp_path, TABLE.replace(old, new))
     with pytest.raises(ConfigError, match=message):
         Segmenter(SegmenterConfig(table=str(path)), ROOMS)
+
+
+def test_each_camera_has_its_own_turn(tmp_path: Path):
+    segmenter = Segmenter(SegmenterConfig(table=str(write_model(tmp_path)), every_n_frames=2), ROOMS)
+    frame = painted(tiny_frames(1)[0])
+    for camera in ("left", "right"):  # in turns, each shown at once
+        view = FrameViews(replace(frame, camera_id=camera, depth_m=None))
+        joint = segmenter.look(view, COARSE).join(flat_view()).probabilities
+        assert np.abs(joint - flat_view().probabilities).max() > 0.05
 
 
 def test_files_that_are_no_model_are_refused_and_the_right_digest_is_not(tmp_path: Path):
