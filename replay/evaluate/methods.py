@@ -94,8 +94,8 @@ class _Scores:
 
 
 def field_predictors(mapper: Mapper) -> dict[str, Predictor]:
-    """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one, and no segmenter
-    sees it), and what its encoder says of the frame alone, where it has an opinion of single images."""
+    """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one, nor shown to a
+    segmenter), and what its encoder says of the frame alone, where it has an opinion of single images."""
     config, model = mapper.pipeline.config, mapper.model
     keyframes = msgspec.structs.replace(config.keyframes, use_current_view=False)
     moving = msgspec.structs.replace(config.moving, classes=config.moving.classes and not config.segmenter.table)
