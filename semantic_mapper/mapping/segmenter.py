@@ -199,25 +199,18 @@ class _Model:
                 f"{where}: {path} makes {shape} of {taken_shape}; it has to make {count} values a pixel, as many as "
                 "`classes`, of one picture of three channels"
             )
+        self._where = where
         self._requests: dict[tuple[int, int], Any] = {}
-        self._try(table, where)
+        self._try(table)
 
-    def _try(self, table: SegmenterTable, where: str) -> None:
+    def _try(self, table: SegmenterTable) -> None:
         """Show it a grey picture as wide as a camera's."""
-        picture = np.zeros((*self.input_size(480, 640, table.width), 3), np.float32)
-        try:
-            values = self.run(picture)
-        except RuntimeError as error:
-            reason = str(error).strip().splitlines()[-1][:300]
-            raise ConfigError(
-                f"{where}: model: it takes no picture of {picture.shape[1]}x{picture.shape[0]} ({reason}); export it "
-                "for one size, or for any"
-            ) from error
+        values = self.run(np.zeros((*self.input_size(480, 640, table.width), 3), np.float32))
         sums = bool(values.min() >= -ROUNDING and np.abs(values.sum(axis=2) - 1).max() <= ROUNDING)
         if sums != (table.output == "probabilities"):
             raise ConfigError(
-                f'{where}: output: "{table.output}", but values of a pixel {"sum" if sums else "do not sum"} to 1; say '
-                f'"{"probabilities" if sums else "logits"}"'
+                f'{self._where}: output: "{table.output}", but values of a pixel {"sum" if sums else "do not sum"} to '
+                f'1; say "{"probabilities" if sums else "logits"}"'
             )
 
     def input_size(self, height: int, width: int, longer: int) -> tuple[int, int]:
@@ -230,12 +223,19 @@ class _Model:
         return height, width
 
     def run(self, picture: Float32) -> Float32:
-        """Outputs (h, w, K) of a prepared picture (H, W, 3)."""
+        """Outputs (h, w, K) of a prepared picture (H, W, 3). ConfigError: the model takes none of its size."""
         size = picture.shape[0], picture.shape[1]
         if size not in self._requests:
-            if not self._is_static:
-                self._reshape(*size)
-            self._requests[size] = compile_request(self._network)
+            try:
+                if not self._is_static:
+                    self._reshape(*size)
+                self._requests[size] = compile_request(self._network)
+            except RuntimeError as error:
+                reason = str(error).strip().splitlines()[-1][:300]
+                raise ConfigError(
+                    f"{self._where}: model: it takes no picture of {size[1]}x{size[0]} ({reason}); export it for one "
+                    "size, or for any"
+                ) from error
         request = self._requests[size]
         put_in = picture if self._channels_last else picture.transpose(2, 0, 1)
         request.infer([np.ascontiguousarray(put_in)[None]], share_inputs=True)

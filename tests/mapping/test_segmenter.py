@@ -159,6 +159,23 @@ def test_each_camera_has_its_own_turn(tmp_path: Path):
         assert np.abs(joint - flat_view().probabilities).max() > 0.05
 
 
+def test_a_size_of_pictures_that_the_model_does_not_take_is_said(tmp_path: Path):
+    path = write_model(tmp_path, TABLE.replace("width = 96", "width = 320"))
+    model = onnx.load(tmp_path / "model.onnx")  # which halves pictures six times, and joins both ends
+    nodes, scales = model.graph.node, np.array([1, 1, 64, 64], np.float32)
+    nodes[0].output[0] = "logits"
+    nodes.append(helper.make_node("AveragePool", ["logits"], ["small"], kernel_shape=[64, 64], strides=[64, 64]))
+    nodes.append(helper.make_node("Resize", ["small", "", "scales"], ["large"]))
+    nodes.append(helper.make_node("Add", ["logits", "large"], ["y"]))
+    model.graph.initializer.append(numpy_helper.from_array(scales, "scales"))
+    onnx.save(model, tmp_path / "model.onnx")
+    segmenter, frame = Segmenter(SegmenterConfig(table=str(path), every_n_frames=1), ROOMS), tiny_frames(1)[0]
+    assert segmenter.look(FrameViews(frame), COARSE).moving.shape == (36, 48)
+    wide = replace(frame, rgb=frame.rgb[:64], depth_m=None, label=None, intrinsics=replace(INTRINSICS, height=64))
+    with pytest.raises(ConfigError, match="takes no picture of 320x224"):
+        segmenter.look(FrameViews(wide), COARSE)
+
+
 def test_files_that_are_no_model_are_refused_and_the_right_digest_is_not(tmp_path: Path):
     path = write_model(tmp_path)
     digest = hashlib.sha256((tmp_path / "model.onnx").read_bytes()).hexdigest()
