@@ -25,6 +25,7 @@ from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SHORTEST_MS, LatencyHistogram, MapSession, open_recording
 from semantic_mapper.replay.summary import notes, summary_table
 from semantic_mapper.types import MapUpdate, PosedFrame
+from tests.mapping.test_segmenter import TABLE, painted, write_model
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 
@@ -273,6 +274,18 @@ def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights
     assert (result.scored, result.excluded, result.refused) == (4, 2, 0)
     assert len({m["pixels"] for m in result.methods.values()}) == 1
     assert result.methods["labels carried by depth"]["total_accuracy"] > 0.5
+
+
+def test_no_segmenter_sees_the_frame_of_a_novel_view(weights, tmp_path):
+    table = TABLE.replace("miss = 0.4", "miss = 0.01").replace("0.1", "0.0001")
+    segmenter = {"table": str(write_model(tmp_path, table)), "every_n_frames": 1}
+    moving = {"motion": False, "classes": True}
+    with_it = field_predictors(Mapper.load(weights, tiny_config(segmenter=segmenter, moving=moving)))
+    without = field_predictors(Mapper.load(weights, tiny_config(moving={"motion": False})))
+    for frame in map(painted, tiny_frames(3)):
+        for name in ("sray", "sray, novel view"):
+            label, plain = with_it[name](frame).label, without[name](frame).label
+            assert np.array_equal(label, plain) is (name != "sray"), name
 
 
 def test_an_unknown_label_costs_one_frame_of_an_evaluation_and_progress_still_ends():
