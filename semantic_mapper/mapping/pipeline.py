@@ -263,16 +263,15 @@ class MappingPipeline:
     def _render_semantics(
         self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded, opinion: Opinion | None
     ) -> tuple[RenderedView, RenderedView]:
-        """The coarse view (h, w) as it is rendered, with the segmenter's opinion where there is one, and with what the
-        frame's image says by itself."""
+        """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself; both joined with the
+        segmenter's opinion where there is one, whose weight does not depend on that of the image."""
         view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
-        if opinion is not None:
-            view = opinion.join(view)
         keyframes = self.config.keyframes
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
         if any(k.labelled for k in self.keyframes.keyframes):
             weight *= OWN_WITH_LABELS
-        return view, add_own_image(view, self.field, current, weight)
+        votes = add_own_image(view, self.field, current, weight)
+        return (view, votes) if opinion is None else (opinion.join(view), opinion.join(votes))
 
     def _render(self, views: FrameViews, sources: list[Encoded], scale: float, renderer: ViewRenderer) -> RenderedView:
         """The view (h, w), ``scale`` times the size of the frame."""

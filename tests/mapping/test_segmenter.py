@@ -132,6 +132,13 @@ def test_it_joins_labels_and_map_and_what_moves_is_left_out(tmp_path: Path):
     assert 0 < len(rendered.xyz) < 0.8 * len(voted.voxel_map.points().xyz)  # without the third that walks
 
 
+def test_its_answer_counts_in_the_map_whatever_the_own_image_weighs(tmp_path: Path):
+    table = str(write_model(tmp_path, TABLE.replace("miss = 0.4", "miss = 0.01").replace("0.1", "0.0001")))
+    pipeline = tiny_pipeline(segmenter={"table": table}, keyframes={"own_image_weight": 1.0})
+    pipeline.step(painted(tiny_frames()[0]))
+    assert (pipeline.voxel_map.points().label == ROOMS.id_of("chair")).mean() > 0.2
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
