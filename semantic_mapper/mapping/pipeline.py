@@ -263,8 +263,8 @@ class MappingPipeline:
     def _render_semantics(
         self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded, opinion: Opinion | None
     ) -> tuple[RenderedView, RenderedView]:
-        """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself; both joined with the
-        segmenter's opinion where there is one, whose weight does not depend on that of the image."""
+        """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself; both joined with
+        the segmenter's opinion where there is one, whose weight does not depend on that of the image."""
         view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
         keyframes = self.config.keyframes
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
