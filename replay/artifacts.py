@@ -73,7 +73,11 @@ def finish_session(
     out.mkdir(parents=True, exist_ok=True)
     clear_results(out)
     voxel_map = session.pipeline.voxel_map
-    graph = remember(voxel_map, before)
+    try:
+        graph = remember(voxel_map, before)
+    except SemanticMapperError as error:  # the map itself is saved all the same
+        _log.error("objects_not_remembered", reason=str(error))
+        graph = None
     progress()
     voxel_map.save(out / MAP_NAME, progress)
     points = voxel_map.points()

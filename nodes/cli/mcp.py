@@ -46,7 +46,7 @@ def mcp(
         changes = changes_of(objects, since_ns)
     else:
         voxel_map, before = (VoxelMap.load(map_path(path)) for path in paths)
-        since_ns, changes = before.last_stamp_ns, changes_between(voxel_map, before)
+        since_ns, changes = before.last_stamp_ns, changes_between(voxel_map, before)[0]
         objects = ObjectMemory.from_bytes(voxel_map.objects).objects  # with the ids of the changes
     now = MapNow(snapshot, objects, up_in(snapshot), since_ns, changes)
     serve(lambda: now)

@@ -16,11 +16,8 @@ from rich.table import Table
 from semantic_mapper.client import UP, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction, nearest_path
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError, TransportError
-from semantic_mapper.geometry import transform
 from semantic_mapper.labels import PLAIN_NAMES
-from semantic_mapper.localization.places import shared_places
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -217,15 +214,10 @@ def _saved_changes(source: str, since: Path | None, picture: Path | None) -> dic
         raise ConfigError("`changes` of a saved map needs the map of before: --since MAP")
     must_be_there(Path(source), since)
     before, now = (VoxelMap.load(map_path(path)) for path in (since, Path(source)))
-    changes = changes_between(now, before)
+    changes, before = changes_between(now, before)
     if picture is not None:
-        points, T = before.points(), np.eye(4)
-        if not shared_places(now.places.places, before.places.places):
-            T = find_alignment(now, before).T_map_other
-        xyz = transform(T, points.xyz.astype(np.float64)).astype(np.float32)
-        up = up_in(MapMirror.of(now).snapshot())
-        title = f"{since} and {source}"
-        write_picture(picture, draw_changes(replace(points, xyz=xyz), now.points(), changes, up, title=title))
+        up, title = up_in(MapMirror.of(now).snapshot()), f"{since} and {source}"
+        write_picture(picture, draw_changes(before.points(), now.points(), changes, up, title=title))
     return map_answers.answer_changes(before.last_stamp_ns, changes)
 
 

@@ -367,9 +367,8 @@ class MappingPipeline:
         if self.config.keyframes.save_places and is_measured(frame) and places.wants(pose):
             assert frame.depth_m is not None
             kept = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy(), T_world_camera=pose.copy())
-            places.add_soon(
-                kept.T_world_camera, partial(_place_of, kept)
-            )  # a copy: the caller may use its arrays again
+            # Of a copy: the caller may use its arrays again.
+            places.add_soon(kept.T_world_camera, partial(_place_of, kept))
         return is_keyframe
 
     def _make_keyframe(self, views: FrameViews, encoded: Encoded, *, labelled: bool = False) -> Keyframe:

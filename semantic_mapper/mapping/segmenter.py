@@ -50,9 +50,8 @@ class SegmenterTable(Config, frozen=True):
     width: Annotated[int, msgspec.Meta(ge=STEP, le=4096)]  # of the longer side of pictures, for a model of any size
     # in the order of the outputs
     classes: Annotated[tuple[str, ...], msgspec.Meta(min_length=2, max_length=MOST_CLASSES)]
-    names: dict[str, str] = msgspec.field(
-        default_factory=dict
-    )  # class of ours by the model's; others are none of these
+    # Class of ours, by class of the model; the model's other classes have no counterpart
+    names: dict[str, str] = msgspec.field(default_factory=dict)
     moving: tuple[str, ...] = ()  # classes of the model that ``moving.classes`` leaves out of the map
     channels: Literal["rgb", "bgr"] = "rgb"
     mean: Triple = (0.0, 0.0, 0.0)  # the input is (value - mean) * scale, of values 0 to 255

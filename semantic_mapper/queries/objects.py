@@ -306,7 +306,7 @@ class ObjectMemory:
         pairs = overlapping(
             [o.surface for o in ours], points, lambda i, j: ours[i].class_id == theirs[there[j]].class_id
         )
-        same = {there[j]: ours[i] for i, j in pairs if ours[i].class_id == theirs[there[j]].class_id}
+        same = {there[j]: ours[i] for i, j in pairs}
         for k, thing in enumerate(theirs):
             if (known := same.get(k)) is None:
                 self._objects[self._next_id] = replace(thing, id=self._next_id)
@@ -415,8 +415,9 @@ def changes_of(objects: Iterable[MapObject], since_ns: int) -> tuple[ObjectChang
     return tuple(sorted(found, key=lambda change: (-change.probability, change.object.id)))
 
 
-def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[ObjectChange, ...]:
-    """What has become of the things of a map of before in a later one, which goes on in it or is of the same place.
+def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange, ...], VoxelMap]:
+    """What has become of the things of a map of before in a later one, which goes on in it or is of the same place; and
+    the map of before, in the world of the later one.
 
     Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
     ``before``; else it then remembers what this finds. Raises MapError: ``now`` is not later, the maps do not fit each
@@ -425,7 +426,7 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[ObjectChange, ...]
     if now.last_stamp_ns <= since:
         raise MapError(f"the last frame of the map ({now.last_stamp_ns} ns) is not later than that of before ({since})")
     if len(theirs) and all((o := ours.get(t.id)) and o.first_seen_ns == t.first_seen_ns for t in theirs.objects):
-        return changes_of(ours.objects, since)
+        return changes_of(ours.objects, since), before
     if not shared_places(now.places.places, before.places.places):
         T = find_alignment(now, before).T_map_other
         aligned = VoxelMap(now.config, now.label_set)
@@ -435,7 +436,7 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[ObjectChange, ...]
     require_metres(now.scale_known, "changes")
     if remember(now, visit_of(before)) is None:
         raise MapError("changes: no floor was found, by which it is known which way is up")
-    return changes_of(ObjectMemory.from_bytes(now.objects).objects, since)
+    return changes_of(ObjectMemory.from_bytes(now.objects).objects, since), before
 
 
 def _moved_by(thing: MapObject, T: Float64) -> MapObject:

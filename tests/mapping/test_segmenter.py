@@ -98,7 +98,7 @@ def test_weight_and_temperature_and_channels_are_of_the_table(tmp_path: Path):
     assert at("")[24] > at("weight = 0.5\n")[24] > 1.5 / len(ROOMS)
     assert at("")[24] > at("temperature = 100.0\n")[24]
     swapped = at('channels = "bgr"\nmean = [1.0, 1.0, 1.0]\nscale = [1.0, 1.0, 1.0]\n')
-    assert swapped[24] == pytest.approx(at("")[24], abs=1e-3)  # green stays, and blue is none now
+    assert swapped[24] == pytest.approx(at("")[24], abs=1e-3)  # green stays, and blue is not found now
     assert swapped[40] < 1 / len(ROOMS) == pytest.approx(at("weight = 0.0\n")[40])
 
 

@@ -65,6 +65,14 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     ).stat().st_size > 10_000
 
 
+def test_a_map_whose_memory_of_objects_is_damaged_is_saved_all_the_same(tmp_path, weights, caplog):
+    session = run(weights, tiny_frames())
+    session.pipeline.voxel_map.objects = b"no memory"
+    finish_session(session, tmp_path)
+    assert VoxelMap.load(tmp_path / "map.npz").frames == len(tiny_frames())
+    assert "objects_not_remembered" in caplog.text
+
+
 def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
     config = tiny_config(quality="fast", render={"scale": 0.5})
     session = MapSession(Mapper.load(weights, config), stream_labels=None)

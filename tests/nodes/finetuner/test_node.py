@@ -144,7 +144,7 @@ def test_keyframes_become_weights_and_the_mapper_has_the_last_word(
         heard.teach([permuted(f) for f in FRAMES[4:]], "bad")
         heard.until(refused=1, set_aside=4, kept=4)
         assert "the last weights were refused" in heard.last.degraded[0]
-        mapper.says(0, first.parent, 1, 1)  # a mapper that began anew
+        mapper.says(0, first.parent, 1, 1)  # a mapper that was started again
         heard.teach(FRAMES[4:])
         second = heard.update()
         assert (second.version, second.parent) == (2, first.parent)
