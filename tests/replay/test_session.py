@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import LabelError
@@ -65,12 +66,13 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     ).stat().st_size > 10_000
 
 
-def test_a_map_whose_memory_of_objects_is_damaged_is_saved_all_the_same(tmp_path, weights, caplog):
+def test_a_map_whose_memory_of_objects_is_damaged_is_saved_all_the_same(tmp_path, weights):
     session = run(weights, tiny_frames())
     session.pipeline.voxel_map.objects = b"no memory"
-    finish_session(session, tmp_path)
+    with capture_logs() as told:
+        finish_session(session, tmp_path)
     assert VoxelMap.load(tmp_path / "map.npz").frames == len(tiny_frames())
-    assert "objects_not_remembered" in caplog.text
+    assert "objects_not_remembered" in [line["event"] for line in told]
 
 
 def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
