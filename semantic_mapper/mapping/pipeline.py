@@ -53,7 +53,7 @@ _aside = ThreadPoolExecutor(1, "aside")  # for a stage that needs one core, whil
 MAX_CAMERAS = 64  # as in a stream's information; something is kept of each
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
 SURE = 0.8  # confidence from which on the map is believed where another field is compared with it
-OWN_WITH_LABELS = 0.25  # of the own image's weight is left where S-Ray has labelled views to render from
+OWN_WITH_LABELS = 0.25  # of the own image's weight is left where all views that a frame is rendered from are labelled
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
 
 P = ParamSpec("P")
@@ -268,8 +268,8 @@ class MappingPipeline:
         view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
         keyframes = self.config.keyframes
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
-        if any(k.labelled for k in self.keyframes.keyframes):
-            weight *= OWN_WITH_LABELS
+        labelled = sum(k.labelled for k in sources) / max(1, len(sources))
+        weight *= 1 - (1 - OWN_WITH_LABELS) * labelled
         votes = add_own_image(view, self.field, current, weight)
         return (view, votes) if opinion is None else (opinion.join(view), opinion.join(votes))
 

@@ -19,6 +19,7 @@ from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.localization.places import Place, PlaceStore
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
+from semantic_mapper.mapping.rendering import add_own_image
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.drawn_room import walk_frames
 from tests.mapping.test_voxel_map import same
@@ -154,6 +155,26 @@ def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
         maps.append(pipeline)
     assert not same(maps[0].voxel_map.block_state(), maps[1].voxel_map.block_state())
     assert same(maps[0].voxel_map.block_state(), maps[2].voxel_map.block_state())
+
+
+def test_the_own_image_weighs_less_by_how_many_views_of_a_frame_are_labelled(monkeypatch: pytest.MonkeyPatch):
+    weights: list[float] = []
+
+    def note(view, field, current, weight):
+        weights.append(weight)
+        return add_own_image(view, field, current, weight)
+
+    monkeypatch.setattr(pipeline_module, "add_own_image", note)
+    frames, config = tiny_frames(), tiny_config(keyframes={"translation_m": 0.01})
+    away = frames[0].T_world_camera.copy()
+    away[:3, 3] += 30
+    maps = []
+    for anchors in ((), (replace(frames[0], T_world_camera=away),), frames[:1]):
+        pipeline = MappingPipeline(config, streaming(tiny_field()), ROOMS, anchors=anchors)
+        assert [len(pipeline.step(f).source_seqs) for f in frames[1:3]] == ([1, 2] if anchors == frames[:1] else [0, 1])
+        maps.append(pipeline.voxel_map.block_state())
+    assert weights == pytest.approx([0.8, 0.8] * 2 + [0.2, 0.5])
+    assert same(maps[0], maps[1])  # a labelled keyframe of another room is no reason to trust these views
 
 
 class SceneField(GridField):
