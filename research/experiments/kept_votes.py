@@ -98,12 +98,14 @@ class _Keeping(MappingPipeline):
         self, views: FrameViews, sources: Any, current: Encoded, opinion: Opinion | None
     ) -> tuple[RenderedView, RenderedView]:
         pair = super()._render_semantics(views, sources, current, opinion)
-        single = self._render(views, [current], self.config.render.scale, self._renderer)
+        scale = self.config.render.scale
+        rendered = self._render(views, self._with_own(sources, current), scale, self._renderer)
+        single = self._render(views, [current], scale, self._renderer)
         own = self.field.source_logits(current)
         assert own is not None
         height, width = single.known.shape
         own = np.asarray(cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-        self.said = pair[0], single, own
+        self.said = rendered, single, own
         return pair
 
     def _keep_view(self, views: FrameViews, current: Encoded, sources: Any) -> bool:

@@ -87,9 +87,11 @@ def softmax_rows(count: int, logits: Float32, out: Float32) -> None:
     """``softmax`` of ``count`` rows (N, L), at most 256 classes."""
 
 
-def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
+def render_sparse_view(
+    view: View, rgb: UInt8, fraction: float
+) -> tuple[Float32, NDArray[np.bool_], Float32, NDArray[np.bool_]]:
     """As ``render_view``, with rays for at most a ``fraction`` (0..1) of the pixels, the most uncertain first, and for
-    every fourth a side at least; and the number of rays.
+    every fourth a side at least; and which pixels (h, w) have one.
 
     Edges of ``rgb`` (H, W, 3) tell where to look closer. Pixels without a ray hold the mean of the known ones round
     them. Raises ShapeError: images of another size than the view."""
@@ -98,27 +100,29 @@ def render_sparse_view(view: View, rgb: UInt8, fraction: float) -> tuple[Float32
     expect_shape(view.prior_depth_m, f"{height} {width}", "depth prior")
     rgb, prior_depth_m = np.ascontiguousarray(rgb), np.ascontiguousarray(view.prior_depth_m)
     probabilities = np.zeros((height, width, len(view.field.label_set)), np.float32)
-    known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
+    known, traced = np.zeros((2, height, width), np.bool_)
+    depth_m = np.zeros((height, width), np.float32)
 
     def trace(flat: NDArray[np.int64]) -> None:
         for part, render in view.trace(flat):
             v, u = np.divmod(part, width)
             probabilities[v, u], known[v, u], depth_m[v, u] = _arrays(render)
+            traced[v, u] = True
 
     coarse = np.arange(height * width).reshape(height, width)[::COARSEST, ::COARSEST].ravel()
     trace(coarse)
-    traced, step = len(coarse), COARSEST
+    rays, step = len(coarse), COARSEST
     while step > 1:
         uncertainty = np.zeros((height, width), np.float32)
         half = step // 2
         rows = (height + half - 1) // half
         fill_between_rays(rows, step, probabilities, known, depth_m, prior_depth_m, rgb, uncertainty)
         flat = np.flatnonzero(uncertainty)
-        left = max(int(fraction * height * width) - traced, 0)
+        left = max(int(fraction * height * width) - rays, 0)
         if len(flat) > left:
             flat = flat[np.argsort(-uncertainty.ravel()[flat], kind="stable")[:left]]
         trace(np.sort(flat))
-        traced, step = traced + len(flat), step // 2
+        rays, step = rays + len(flat), step // 2
     return probabilities, known, depth_m, traced
 
 

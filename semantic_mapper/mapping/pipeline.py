@@ -53,7 +53,9 @@ _aside = ThreadPoolExecutor(1, "aside")  # for a stage that needs one core, whil
 MAX_CAMERAS = 64  # as in a stream's information; something is kept of each
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
 SURE = 0.8  # confidence from which on the map is believed where another field is compared with it
-OWN_WITH_LABELS = 0.25  # of the own image's weight is left where all views that a frame is rendered from are labelled
+OWN_WITH_LABELS = 0.25  # of the own image's weight is left where a frame is rendered from labelled views, too
+OWN_BETWEEN_RAYS = 0.5  # of it counts in the rendered view between rays, where none is labelled
+RAYS_WITHOUT_LABELS = 0.7  # of ``render.ray_fraction`` are rendered then
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
 
 P = ParamSpec("P")
@@ -263,18 +265,26 @@ class MappingPipeline:
     def _render_semantics(
         self, views: FrameViews, sources: Sequence[Keyframe], current: Encoded, opinion: Opinion | None
     ) -> tuple[RenderedView, RenderedView]:
-        """The coarse view (h, w) as it is rendered, and with what the frame's image says by itself; both joined with
-        the segmenter's opinion where there is one, whose weight does not depend on that of the image."""
-        view = self._render(views, self._with_own(sources, current), self.config.render.scale, self._renderer)
+        """The coarse view (h, w) as it is rendered, joined with what the frame's image says by itself between rays; and
+        joined with it everywhere. Both joined with the segmenter's opinion where there is one, whose weight does not
+        depend on that of the image."""
         keyframes = self.config.keyframes
         weight = keyframes.own_image_weight if keyframes.use_current_view else 0.0
-        labelled = sum(k.labelled for k in sources) / max(1, len(sources))
-        weight *= 1 - (1 - OWN_WITH_LABELS) * labelled
-        votes = add_own_image(view, self.field, current, weight)
+        own = self.field.source_logits(current) if weight else None
+        labelled = any(k.labelled for k in sources)
+        share = RAYS_WITHOUT_LABELS if own is not None and not labelled else 1.0
+        rendered_from = self._with_own(sources, current)
+        view = votes = self._render(views, rendered_from, self.config.render.scale, self._renderer, share)
+        if own is not None:
+            votes = add_own_image(view, own, weight * (OWN_WITH_LABELS if labelled else 1.0))
+            if not labelled and view.traced is not None:
+                view = add_own_image(view, own, weight * OWN_BETWEEN_RAYS, ~view.traced)
         return (view, votes) if opinion is None else (opinion.join(view), opinion.join(votes))
 
-    def _render(self, views: FrameViews, sources: list[Encoded], scale: float, renderer: ViewRenderer) -> RenderedView:
-        """The view (h, w), ``scale`` times the size of the frame."""
+    def _render(
+        self, views: FrameViews, sources: list[Encoded], scale: float, renderer: ViewRenderer, share: float = 1.0
+    ) -> RenderedView:
+        """The view (h, w), ``scale`` times the size of the frame, with a ``share`` of the rays that it may have."""
         frame = views.frame
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
         if not sources:
@@ -292,7 +302,8 @@ class MappingPipeline:
             measured=(views.depth(intrinsics) > 0) & (prior > 0) if frame.depth_m is not None else None,
             stamp_ns=frame.stamp_ns,
         )
-        return renderer.render(view, views.rgb(intrinsics), computed=frame.depth_sigma_m is not None)
+        computed = frame.depth_sigma_m is not None
+        return renderer.render(view, views.rgb(intrinsics), computed=computed, share=share)
 
     @property
     def _holds_scene(self) -> bool:

@@ -1,6 +1,6 @@
 """The semantics of one view, with as many rays and samples as the settings, or the rate to hold, allow.
 
-``add_own_image`` joins it with what the frame's image says by itself at every coarse pixel; rays are few. ``upsample``
+``add_own_image`` joins it with what the frame's image says by itself at coarse pixels; rays are few. ``upsample``
 brings the coarse view to the size of the frame, along the edges of its image and depth: an index a pixel, not a vector
 of probabilities a pixel."""
 
@@ -31,13 +31,14 @@ MEMORY = 0.7  # of what was known stays when a new frame is measured
 
 class RenderedView(NamedTuple):
     """What a field says of a view. ``rays`` were rendered, with so many ``samples`` each; 0 where the field draws its
-    own."""
+    own. Pixels that are not ``traced`` have none and hold the mean of those round them; None: all have one."""
 
     probabilities: Float32  # (h, w, L)
     known: Bool  # (h, w) where they mean something
     depth_m: Float32  # (h, w), or 0
     rays: int = 0
     samples: int = 0
+    traced: Bool | None = None  # (h, w)
 
 
 class ViewRenderer:
@@ -57,10 +58,11 @@ class ViewRenderer:
         if self._rate_controller is not None:
             self._rate_controller.note(render_ms, other_ms, *self._last)
 
-    def render(self, view: View, rgb: UInt8, *, computed: bool = False) -> RenderedView:
+    def render(self, view: View, rgb: UInt8, *, computed: bool = False, share: float = 1.0) -> RenderedView:
         """Render a view (h, w) of the field, with samples as the settings, or the rate to hold, say.
 
-        ``rgb`` is (h, w, 3) uint8; ``computed``: the depth prior was computed from pictures and may be farther off."""
+        ``rgb`` is (h, w, 3) uint8; ``computed``: the depth prior was computed from pictures and may be farther off;
+        ``share`` of the rays is enough, where not all pixels have one."""
         prior_m = view.prior_depth_m
         fraction, sampling = self._config.ray_fraction, self._sampling
         if self._rate_controller is not None:
@@ -77,26 +79,25 @@ class ViewRenderer:
         view = replace(view, sampling=sampling)
         if fraction == 1:
             probabilities, known, depth_m = render_view(view)
-            rays = prior_m.size
+            rays, traced = prior_m.size, None
         else:
-            probabilities, known, depth_m, rays = render_sparse_view(view, rgb, fraction)
+            probabilities, known, depth_m, traced = render_sparse_view(view, rgb, share * fraction)
+            rays = int(np.count_nonzero(traced))
         self._last = (0 if blind else rays, samples)
-        return RenderedView(probabilities, known, depth_m, rays, samples)
+        return RenderedView(probabilities, known, depth_m, rays, samples, traced)
 
 
-def add_own_image(view: RenderedView, field: StreamField[Any], current: Any, weight: float) -> RenderedView:
-    """The weighted geometric mean of a view (h, w) and what the frame's own image, encoded, says by itself, where it is
-    known; the view itself where the field has no opinion of single images, or ``weight``, 0..1, is 0."""
-    own = field.source_logits(current) if weight else None
-    if own is None:
-        return view
-    height, width = view.known.shape
-    if own.shape[:2] != view.known.shape:
-        own = cv2.resize(own, (width, height), interpolation=cv2.INTER_LINEAR)
+def add_own_image(view: RenderedView, own: Float32, weight: float, where: Bool | None = None) -> RenderedView:
+    """The geometric mean of a view (h, w) and what the frame's own image says by itself, logits of any size, which
+    weighs 0..1; where the view is known, and only ``where`` (h, w) is true."""
+    size = view.known.shape
+    if own.shape[:2] != size:
+        own = np.asarray(cv2.resize(own, size[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
     own = np.ascontiguousarray(own, np.float32)
     joined = view.probabilities.copy()
     rows = (own.reshape(-1, own.shape[2]), joined.reshape(-1, own.shape[2]))
-    join_opinions(len(rows[0]), *rows, np.ascontiguousarray(view.known).ravel(), weight, PROBABILITY_FLOOR)
+    known = view.known if where is None else view.known & where
+    join_opinions(len(rows[0]), *rows, np.ascontiguousarray(known).ravel(), weight, PROBABILITY_FLOOR)
     return view._replace(probabilities=joined)
 
 

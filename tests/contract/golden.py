@@ -145,7 +145,7 @@ def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, str]]:
 
 def lacking(then: Any, now: Any, where: str = "") -> list[str]:
     """What ``then`` (a form) has and ``now`` lacks or has otherwise; keys that came since are welcome."""
-    if then == "NoneType":  # null then: whatever it is when it is something
+    if "NoneType" in (then, now):  # what may be null, as a room before a floor is known; its type is decoded elsewhere
         return []
     if isinstance(then, Mapping):
         if not isinstance(now, Mapping):

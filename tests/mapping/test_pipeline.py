@@ -19,8 +19,8 @@ from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.localization.places import Place, PlaceStore
 from semantic_mapper.mapping import pipeline as pipeline_module
 from semantic_mapper.mapping.pipeline import FieldTrial, MappingPipeline
-from semantic_mapper.mapping.rendering import add_own_image
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.mapping.rendering import RenderedView, add_own_image
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 from tests.drawn_room import walk_frames
 from tests.mapping.test_voxel_map import same
 from tests.small import tiny_config, tiny_field, tiny_frames, tiny_pipeline
@@ -157,12 +157,13 @@ def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
     assert same(maps[0].voxel_map.block_state(), maps[2].voxel_map.block_state())
 
 
-def test_the_own_image_weighs_less_by_how_many_views_of_a_frame_are_labelled(monkeypatch: pytest.MonkeyPatch):
+def test_the_own_image_weighs_less_where_views_of_a_frame_are_labelled(monkeypatch: pytest.MonkeyPatch):
     weights: list[float] = []
 
-    def note(view, field, current, weight):
-        weights.append(weight)
-        return add_own_image(view, field, current, weight)
+    def note(view, own, weight, where=None):
+        if where is None:  # the votes; else what is shown between rays
+            weights.append(weight)
+        return add_own_image(view, own, weight, where)
 
     monkeypatch.setattr(pipeline_module, "add_own_image", note)
     frames, config = tiny_frames(), tiny_config(keyframes={"translation_m": 0.01})
@@ -173,8 +174,28 @@ def test_the_own_image_weighs_less_by_how_many_views_of_a_frame_are_labelled(mon
         pipeline = MappingPipeline(config, streaming(tiny_field()), ROOMS, anchors=anchors)
         assert [len(pipeline.step(f).source_seqs) for f in frames[1:3]] == ([1, 2] if anchors == frames[:1] else [0, 1])
         maps.append(pipeline.voxel_map.block_state())
-    assert weights == pytest.approx([0.8, 0.8] * 2 + [0.2, 0.5])
+    assert weights == pytest.approx([0.8, 0.8] * 2 + [0.2, 0.2])
     assert same(maps[0], maps[1])  # a labelled keyframe of another room is no reason to trust these views
+
+
+def test_without_labelled_views_fewer_rays_are_rendered_and_the_own_image_fills_between_them(monkeypatch):
+    frames, config = tiny_frames(4), tiny_config(render={"encode_width": 96, "scale": 0.5, "ray_fraction": 0.3})
+
+    def last_of(anchors: list[PosedFrame]) -> tuple[MapUpdate, RenderedView]:
+        shown: list[RenderedView] = []
+        pipeline = MappingPipeline(config, streaming(tiny_field(), config.sampling), ROOMS, anchors=anchors)
+        render = pipeline._render_semantics
+        pipeline._render_semantics = lambda *args: shown.append(render(*args)[0]) or render(*args)
+        return [pipeline.step(frame) for frame in frames][-1], shown[-1]
+
+    labelled, unlabelled = last_of(list(frames[:2])), last_of([])
+    assert labelled[0].rays <= 0.3 * 48 * 36 and unlabelled[0].rays <= 0.7 * 0.3 * 48 * 36 < labelled[0].rays
+    monkeypatch.setattr(pipeline_module, "OWN_BETWEEN_RAYS", 0.0)
+    (_, view), (_, alone) = unlabelled, last_of([])
+    traced, known = view.traced, view.known
+    assert traced is not None and (known & ~traced).any()
+    np.testing.assert_array_equal(view.probabilities[traced], alone.probabilities[traced])
+    assert (view.probabilities != alone.probabilities)[known & ~traced].any(axis=1).mean() > 0.9
 
 
 class SceneField(GridField):

@@ -38,19 +38,6 @@ def test_probabilities_and_the_likeliest_class_are_those_of_numpy(classes: int):
     assert np.array_equal(channel, found.argmax(axis=2)) and np.array_equal(most, found.max(axis=2))
 
 
-class Says:
-    """A field with a given opinion (h, w, L) of images."""
-
-    def __init__(self, logits: np.ndarray | None) -> None:
-        self.logits = logits
-
-    def release(self):
-        raise NotImplementedError
-
-    def source_logits(self, sources):
-        return self.logits
-
-
 def rendered(probabilities: np.ndarray, known: np.ndarray) -> RenderedView:
     return RenderedView(probabilities.astype(np.float32), known, np.ones(known.shape, np.float32), 1, 1)
 
@@ -58,13 +45,16 @@ def rendered(probabilities: np.ndarray, known: np.ndarray) -> RenderedView:
 def test_both_opinions_are_joined_as_their_geometric_mean_where_the_view_is_known(rng: np.random.Generator) -> None:
     view_p, own_p = rng.dirichlet(np.ones(4), (3, 5)), rng.dirichlet(np.ones(4), (3, 5))
     known = rng.random((3, 5)) < 0.7
-    field = Says(np.log(own_p))
-    found = add_own_image(rendered(view_p, known), field, None, 0.3)  # type: ignore[arg-type]
+    found = add_own_image(rendered(view_p, known), np.log(own_p), 0.3)
     expected = np.maximum(own_p, 1e-4) ** 0.3 * np.maximum(view_p, 1e-4) ** 0.7
     expected /= expected.sum(axis=2, keepdims=True)
     np.testing.assert_allclose(found.probabilities[known], expected[known], atol=1e-5)
     np.testing.assert_array_equal(found.probabilities[~known], view_p.astype(np.float32)[~known])
     assert found.probabilities.dtype == np.float32
+    where = rng.random((3, 5)) < 0.5
+    between = add_own_image(rendered(view_p, known), np.log(own_p), 0.3, where).probabilities
+    np.testing.assert_array_equal(between[where], found.probabilities[where])
+    np.testing.assert_array_equal(between[~where], view_p.astype(np.float32)[~where])
 
 
 PIXELS = 19_200
