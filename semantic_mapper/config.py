@@ -189,7 +189,7 @@ class KeyframeConfig(Config, frozen=True):
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
     # Weight of what its image says by itself, against the rendered view, in what it tells the map; its own labels are
-    # those of the rendered view. A quarter of it where weights were finetuned on keyframes of the place.
+    # those of the rendered view. A quarter of it where finetuned keyframes are among the source views.
     own_image_weight: Fraction = 0.8
     # Whether the map keeps features of views that its sensor measured (45 kB each, 300 at most), by which it is found
     # again: `query MAP relocalize LOG`, `up --set map=...`, `merge`. Images can be guessed from such features; False
