@@ -24,6 +24,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import cv2
 import msgspec
 import numpy as np
+import openvino as ov
 
 from semantic_mapper.config import Config, Fraction, Positive, SegmenterConfig, load_config, nearest, nearest_path
 from semantic_mapper.errors import ConfigError, FrameError
@@ -56,7 +57,8 @@ class SegmenterTable(Config, frozen=True):
     channels: Literal["rgb", "bgr"] = "rgb"
     mean: Triple = (0.0, 0.0, 0.0)  # the input is (value - mean) * scale, of values 0 to 255
     scale: Triple = (1.0, 1.0, 1.0)
-    output: Literal["logits", "probabilities"] = "logits"
+    output: Literal["logits", "probabilities"] = "logits"  # of floats; whole numbers are those of classes
+    output_name: str = ""  # of a model with several outputs
     temperature: Positive = 1.0  # that logits are divided by
     miss: Fraction = 0.5  # of pixels of a class of ours: those that the model gives to none
     false_alarm: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.02  # of pixels of other classes: those given to one
@@ -159,8 +161,12 @@ class Segmenter:
         return (picture.astype(np.float32) - mean) * scale
 
     def _likelihood(self, outputs: Float32, size: tuple[int, int]) -> Float32:
-        """(h, w, G + 1) of outputs (a, b, K)."""
-        likelihood = _probabilities(_spread(outputs, size), self.table) @ self._columns
+        """(h, w, G + 1) of outputs (a, b, K), or numbers of classes (a, b)."""
+        if outputs.ndim == 2:
+            at = cv2.resize(outputs, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+            likelihood = self._columns[at.astype(np.int64)]
+        else:
+            likelihood = _probabilities(_spread(outputs, size), self.table) @ self._columns
         likelihood[..., :-1] **= np.float32(self.table.weight)
         return likelihood
 
@@ -177,12 +183,12 @@ class _Model:
         if table.sha256 and digest != table.sha256.lower():
             raise ConfigError(f"{where}: sha256 is not that of {path} ({digest}); fetch the model again")
         try:
-            self._network = core().read_model(path)
-            (taken,), (given,) = self._network.inputs, self._network.outputs
+            self._network = network = _with_one_output(core().read_model(path), table.output_name)
+            (taken,), (given,) = network.inputs, network.outputs
             self._channels_last = taken.partial_shape[3] == 3
-            self._is_static = not taken.partial_shape.is_dynamic
-            if not self._is_static:
-                self._reshape(*self.input_size(table.width, table.width, table.width))
+            sides = [taken.partial_shape[i] for i in ((1, 2) if self._channels_last else (2, 3))]
+            self._fixed = None if any(n.is_dynamic for n in sides) else (sides[0].get_length(), sides[1].get_length())
+            self._reshape(*self.input_size(table.width, table.width, table.width))
             shape, taken_shape = list(given.get_shape()), list(taken.get_shape())
         except (RuntimeError, ValueError, IndexError) as error:
             reason = str(error).strip().splitlines()[-1][:300]
@@ -190,13 +196,14 @@ class _Model:
                 f"{where}: model: {path} is no network of one picture (1, 3, H, W) or (1, H, W, 3) and one output that "
                 f"OpenVINO reads ({reason})"
             ) from error
-        count = len(table.classes)
+        self._count = count = len(table.classes)
         self._classes_last = len(shape) == 4 and shape[3] == count
-        is_picture = taken_shape[0] == 1 and taken_shape[3 if self._channels_last else 1] == 3
-        if not is_picture or len(shape) != 4 or shape[0] != 1 or count not in (shape[1], shape[3]):
+        one = shape[1:] if len(shape) == 3 else [n for n in shape[1:] if n != 1]
+        self._gives_numbers = given.element_type.is_integral() and shape[0] == 1 and len(one) == 2
+        if not self._gives_numbers and (len(shape) != 4 or shape[0] != 1 or count not in (shape[1], shape[3])):
             raise ConfigError(
                 f"{where}: {path} makes {shape} of {taken_shape}; it has to make {count} values a pixel, as many as "
-                "`classes`, of one picture of three channels"
+                "`classes`, or the whole number of one, of one picture of three channels"
             )
         self._where = where
         self._requests: dict[tuple[int, int], Any] = {}
@@ -205,6 +212,8 @@ class _Model:
     def _try(self, table: SegmenterTable) -> None:
         """Show it a grey picture as wide as a camera's."""
         values = self.run(np.zeros((*self.input_size(480, 640, table.width), 3), np.float32))
+        if self._gives_numbers:
+            return
         sums = bool(values.min() >= -ROUNDING and np.abs(values.sum(axis=2) - 1).max() <= ROUNDING)
         if sums != (table.output == "probabilities"):
             raise ConfigError(
@@ -214,20 +223,19 @@ class _Model:
 
     def input_size(self, height: int, width: int, longer: int) -> tuple[int, int]:
         """Height and width of the picture that is put in, for an image of a size."""
-        if self._is_static:
-            shape = list(self._network.inputs[0].get_shape())
-            return (shape[1], shape[2]) if self._channels_last else (shape[2], shape[3])
+        if self._fixed:
+            return self._fixed
         sides = (longer - STEP * round(longer * (1 - n / max(height, width)) / STEP) for n in (height, width))
         height, width = (max(STEP, n) for n in sides)
         return height, width
 
     def run(self, picture: Float32) -> Float32:
-        """Outputs (h, w, K) of a prepared picture (H, W, 3). ConfigError: the model takes none of its size."""
+        """Outputs (h, w, K) of a prepared picture (H, W, 3), or numbers of classes (h, w). ConfigError: the model takes
+        none of its size, or gives a class that the table lacks."""
         size = picture.shape[0], picture.shape[1]
         if size not in self._requests:
             try:
-                if not self._is_static:
-                    self._reshape(*size)
+                self._reshape(*size)
                 self._requests[size] = compile_request(self._network)
             except RuntimeError as error:
                 reason = str(error).strip().splitlines()[-1][:300]
@@ -239,10 +247,27 @@ class _Model:
         put_in = picture if self._channels_last else picture.transpose(2, 0, 1)
         request.infer([np.ascontiguousarray(put_in)[None]], share_inputs=True)
         out = np.asarray(request.get_output_tensor(0).data, np.float32)[0]
+        if self._gives_numbers:
+            if not 0 <= out.min() <= out.max() < self._count:
+                raise ConfigError(
+                    f"{self._where}: classes: the model gives classes {out.min():.0f} to {out.max():.0f}, but "
+                    f"{self._count} are named, from 0; name all, in its order"
+                )
+            return out.reshape(out.shape[:2] if out.shape[-1] == 1 else out.shape[-2:])
         return out if self._classes_last else out.transpose(1, 2, 0)
 
     def _reshape(self, height: int, width: int) -> None:
         self._network.reshape([1, height, width, 3] if self._channels_last else [1, 3, height, width])
+
+
+def _with_one_output(network: ov.Model, name: str) -> ov.Model:
+    """The network without what only other outputs need. ValueError: it is not clear which one is meant."""
+    names = [min(output.names, key=len, default=str(i)) for i, output in enumerate(network.outputs)]
+    if name not in names and (name or len(names) > 1):
+        raise ValueError(
+            f'say `output_name = "{names[0]}"` in the table, or another of its outputs: {", ".join(names)}'
+        )
+    return ov.Model([network.get_results()[names.index(name) if name else 0]], network.get_parameters())
 
 
 def _likelihoods(answers: list[int], count: int, miss: float, false_alarm: float) -> Float32:

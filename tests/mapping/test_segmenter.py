@@ -183,6 +183,51 @@ def test_a_size_of_pictures_that_the_model_does_not_take_is_said(tmp_path: Path)
         segmenter.look(FrameViews(wide), COARSE)
 
 
+def write_export(folder: Path, taken: str, given: str, nodes: str, table: str = TABLE) -> Path:
+    """A model whose logits "y" go through some nodes, and its table."""
+    logits = f"gain = Constant<value_float = {GAIN}>() y = Mul(x, gain)"
+    text = f'<ir_version: 8, opset_import: ["": 17]> m (float[{taken}] x) => ({given}) {{ {logits} {nodes} }}'
+    onnx.save(onnx.parser.parse_model(text), folder / "model.onnx")
+    (folder / "table.toml").write_text(table)
+    return folder / "table.toml"
+
+
+TWO = "float[n,3,a,b] out, float[n,3,a,b] aux", "out = Identity(y) aux = Neg(y)"
+LABELS = "int64[n,1,a,b] labels", "labels = ArgMax<axis = 1>(y)"
+
+
+@pytest.mark.parametrize("taken", ["n,3,h,w", "n,3,72,96", "1,3,72,96"])
+@pytest.mark.parametrize(
+    ("given", "nodes", "more"),
+    [
+        (*TWO, 'output_name = "out"'),
+        ("float[n,3,a,b] logits", "logits = AveragePool<kernel_shape = [4, 4], strides = [4, 4]>(y)", ""),
+        ("int64[n,a,b] labels", "labels = ArgMax<axis = 1, keepdims = 0>(y)", ""),
+        (*LABELS, ""),
+    ],
+)
+def test_usual_exports_are_taken(tmp_path: Path, taken: str, given: str, nodes: str, more: str):
+    path = write_export(tmp_path, taken, given, nodes, f"{more}\n{TABLE}")
+    opinion = Segmenter(SegmenterConfig(table=str(path)), ROOMS).look(FrameViews(painted(tiny_frames()[0])), COARSE)
+    left, middle, right = opinion.join(flat_view()).probabilities[18, [8, 24, 40], ROOMS.names.index("chair")]
+    assert middle > 2 * left and middle > 2 * right
+    assert opinion.moving[:, 40:].all() and not opinion.moving[:, :28].any()
+
+
+@pytest.mark.parametrize("more", ["", 'output_name = "uot"'])
+def test_outputs_that_are_not_clear_are_said(tmp_path: Path, more: str):
+    path = write_export(tmp_path, "n,3,h,w", *TWO, f"{more}\n{TABLE}")
+    with pytest.raises(ConfigError, match=r'say `output_name = "out"` in the table, .* out, aux'):
+        Segmenter(SegmenterConfig(table=str(path)), ROOMS)
+
+
+def test_a_class_without_a_name_is_said(tmp_path: Path):
+    table = TABLE.replace(', "walker"]', "]").replace("moving", "# ").replace(', walker = "person"', "")
+    segmenter = Segmenter(SegmenterConfig(table=str(write_export(tmp_path, "n,3,h,w", *LABELS, table))), ROOMS)
+    with pytest.raises(ConfigError, match="gives classes 0 to 2, but 2 are named"):
+        segmenter.look(FrameViews(painted(tiny_frames()[0])), COARSE)
+
+
 def test_files_that_are_no_model_are_refused_and_the_right_digest_is_not(tmp_path: Path):
     path = write_model(tmp_path)
     digest = hashlib.sha256((tmp_path / "model.onnx").read_bytes()).hexdigest()
