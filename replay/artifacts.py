@@ -234,6 +234,7 @@ def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "surface_points": len(points.xyz),
             "cleared_voxels": voxel_map.cleared,
             "moving_pixels": pipeline.moving.pixels,
+            "moving_warning": session.moving_warning or None,
             "unknown": round(float((points.label == label_set.ignore_id).mean()), 4) if len(points.xyz) else None,
             "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),

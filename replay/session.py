@@ -19,6 +19,7 @@ import numpy as np
 from semantic_mapper.errors import FrameError, LabelError, PoseError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.weights import WeightsFile
+from semantic_mapper.imaging import is_measured
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
@@ -220,6 +221,8 @@ class MapSession:
                 _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
             self.computed_depth += 1
             self.too_little_motion += not frame.depth_m.any()
+        if self.without_depth + self.computed_depth == 1 and not is_measured(frame) and self.moving_warning:
+            _log.warning("moving_classes_stay", seq=frame.seq, camera=frame.camera_id, reason=self.moving_warning)
         self._note_range(frame)
         # How much weights of one scene know of it: weights of another scene cannot be recognised otherwise.
         known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
@@ -268,9 +271,21 @@ class MapSession:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with most frames: depth out of range, pictures unlike those that the weights learned from."""
+        """What is wrong with frames: depth out of range, pictures unlike those that the weights learned from, no
+        measured depth for ``moving.classes``."""
         check = self.pipeline.domain_check
-        return self.range_warning, "" if check is None else check.warning
+        return self.range_warning, "" if check is None else check.warning, self.moving_warning
+
+    @property
+    def moving_warning(self) -> str:
+        """Why what moves by its class may be in the map all the same; empty where ``moving.classes`` works."""
+        unmeasured = self.without_depth + self.computed_depth
+        if not (unmeasured and self.pipeline.config.moving.classes):
+            return ""
+        return (
+            f"moving.classes left nothing out of {counted(unmeasured, 'frame')} whose depth no sensor measured: what "
+            "moves there may be in the map; use a depth sensor, or film while nothing moves"
+        )
 
     def follow_weights(self, weights: WeightsFile, path: Path) -> None:
         """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""

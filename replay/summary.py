@@ -128,7 +128,13 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-_WARNINGS = ("map.nearly_empty", "pose_check.warning", "depth.range_warning", "pictures.unlike_training_warning")
+_WARNINGS = (
+    "map.nearly_empty",
+    "pose_check.warning",
+    "depth.range_warning",
+    "pictures.unlike_training_warning",
+    "map.moving_warning",
+)
 _RESULTS = {
     ("report.html", "overview.png"): "pictures: {}",
     ("map.npz", "map.ply"): "map: {}, for `query`, `view`, `export`",

@@ -39,8 +39,8 @@ def weights(tmp_path):
     return tmp_path / "w.safetensors"
 
 
-def run(weights, frames, rerun=None, depth="auto", **options):
-    mapper = Mapper.load(weights, tiny_config(depth={"source": depth}))
+def run(weights, frames, rerun=None, depth="auto", moving=None, **options):
+    mapper = Mapper.load(weights, tiny_config(depth={"source": depth}, moving=moving or {}))
     recording = open_recording(rerun, mapper.pipeline)
     session = MapSession(mapper, stream_labels=ROOMS, source="test", rerun=recording, **options)
     for frame in frames:
@@ -123,6 +123,20 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     points = VoxelMap.load(tmp_path / "out/map.npz").points()
     fraction = 1 - points.measured.mean() if len(points.xyz) else None
     assert summary["map"]["computed"] == (None if fraction is None else pytest.approx(fraction, abs=1e-4))
+
+
+def test_moving_classes_that_no_depth_sensor_serves_are_in_log_status_and_summary(tmp_path, weights):
+    frames = tiny_frames(3)
+    films = [replace(f, depth_m=None) for f in frames[1:]]
+    for stream, on, said in (((frames[0], *films), True, "2 frames"), (films, False, ""), (frames, True, "")):
+        with capture_logs() as logs:
+            session = run(weights, stream, moving={"classes": on})
+        assert [line["event"] for line in logs].count("moving_classes_stay") == bool(said)
+        (warning,) = [w for w in session.warnings if "moving.classes" in w] if said else session.warnings[-1:]
+        summary = finish_session(session, tmp_path)
+        assert said in warning and bool(warning) == bool(said)
+        assert summary["map"]["moving_warning"] == (warning or None)
+        assert any("moving.classes" in note for note in notes(summary)) == bool(said)
 
 
 def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights, subtitles, monkeypatch):
