@@ -101,7 +101,7 @@ class MappingPipeline:
         self._viewpoints = ViewpointChooser(config.seed)
         self._renderer = ViewRenderer(field, config.render, config.sampling)
         self.corrector = MapCorrector(
-            config.history, self.voxel_map, self.keyframes, self._fuse_again, self.moving.clear
+            config.history, self.voxel_map, self.keyframes, self._fuse_again, self._follow_correction
         )
         self._steps = 0
         self._intrinsics: dict[str, CameraIntrinsics] = {}  # by camera
@@ -248,7 +248,7 @@ class MappingPipeline:
         intrinsics = working_intrinsics(views.frame.intrinsics, COVERAGE_WIDTH)
         count = self.config.keyframes.source_views - int(self.config.keyframes.use_current_view)
         chosen = keyframes.choose(views.frame.T_world_camera, intrinsics, views.depth(intrinsics), count, current.size)
-        if not chosen and self._holds_scene:  # what it says does not depend on the views
+        if not chosen and self.field.holds_scene:  # what it says does not depend on the views
             chosen = [k for k in keyframes.keyframes if k.encoded.size == current.size][-1:]
         return chosen
 
@@ -305,15 +305,11 @@ class MappingPipeline:
         computed = frame.depth_sigma_m is not None
         return renderer.render(view, views.rgb(intrinsics), computed=computed, share=share)
 
-    @property
-    def _holds_scene(self) -> bool:
-        return self.field.holds_scene
-
     def _depth_prior(self, views: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast; nowhere,
         without a sensor, for a field that holds the scene."""
         frame, depth = views.frame, views.depth(intrinsics)
-        if self._holds_scene and not is_measured(frame):
+        if self.field.holds_scene and not is_measured(frame):
             return np.zeros_like(depth)
         if frame.depth_m is not None:
             return depth_prior(depth, views.rgb(intrinsics))
@@ -364,6 +360,18 @@ class MappingPipeline:
     def _fuse_again(self, voxel_map: VoxelMap, frame: PosedFrame, view: RenderedView) -> None:
         """Integrate a frame of the history into a map."""
         self._fuse(voxel_map, self._upsample(FrameViews(frame), view, voxel_map), view)
+
+    def _follow_correction(self) -> None:
+        """Drop or move what is known of frames by their poses, as a correction begins and as the map has moved."""
+        self.moving.clear()
+        if self._segmenter is not None:
+            self._segmenter.clear()
+        if self.corrector.status.running:
+            return
+        self.pose_check.compare_again(self.keyframes.keyframes)
+        if (last := self.last_pose) is not None:
+            moved = self.corrector.poses().get((last.camera_id, last.stamp_ns), last.T_map_camera)
+            self.last_pose = replace(last, T_map_camera=moved)
 
     def _keep_view(self, views: FrameViews, current: Encoded, sources: Sequence[Keyframe]) -> bool:
         """Keep a frame as a source view (whether it became one), and as a place, where it shows something new."""

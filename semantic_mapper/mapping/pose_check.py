@@ -48,10 +48,7 @@ _REP_103 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 STILL_M, STILL_DEG = 1e-3, 0.1  # that a pose which stands still may change by
 STILL_VIEWS, STILL_FRAMES = 6, 600  # different views at one pose that contradict it, and frames among which they are
 SAME_VIEW = 0.5  # correlation from which on parts of two pictures show the same
-_SIZE, _PARTS = (
-    (80, 60),
-    (6, 10, 8, 10),
-)  # of a picture that is compared; its rows of parts, columns, and pixels of each
+_SIZE, _PARTS = (80, 60), (6, 10, 8, 10)  # of a picture that is compared; rows of parts, pixels, columns, pixels
 _TEXTURED = 6.0  # grey levels that a part with texture varies by
 ALIKE = 0.8  # of the overlap that keyframes have as they are; a cause that leaves less has but moved them apart
 
@@ -77,7 +74,8 @@ _CAUSES: tuple[tuple[str, Callable[[Float64], Float64], float], ...] = (
 class PoseCheck:
     """Compares keyframes, and pictures at one pose, as they come; changes nothing. ``compared`` keyframes overlap with
     earlier ones; ``worst`` and ``worst_contradicting`` are the largest ``recent`` and ``contradicting`` so far.
-    ``warning`` says what is wrong and how to fix it; it stays, as the map keeps what was fused."""
+    ``warning`` says what is wrong and how to fix it; it stays, as the map keeps what was fused, until keyframes move
+    (``compare_again``)."""
 
     def __init__(self, depth_max_m: float) -> None:
         self._limit_m = FAR * depth_max_m
@@ -86,10 +84,11 @@ class PoseCheck:
         self._places: dict[str, tuple[Float64, int, list[Float32]]] = {}  # camera -> pose, since which frame, views
         self._frames = 0
         self._moving: dict[tuple[str, int], float] = {}  # keyframe -> fraction seen through against the one before it
+        self._measured: set[tuple[str, int]] = set()  # keyframes that were given to ``add``
         self.compared = 0
         self.worst: float | None = None
         self.worst_contradicting: float | None = None
-        self.warning = ""
+        self.warning = self._stands_still = ""
 
     @property
     def recent(self) -> float | None:
@@ -118,7 +117,7 @@ class PoseCheck:
         # Views after a known one were of something that came between, and has left: the camera has not moved.
         self._places[frame.camera_id] = pose, since, [*views, new][: known + 1]
         if known + 1 >= STILL_VIEWS:
-            self.warning = (
+            self.warning = self._stands_still = (
                 f"poses stand still while the camera moves: {STILL_VIEWS} different views at one pose up to frame "
                 f"seq={frame.seq}: the map cannot be trusted. Check that each frame has its own pose (lost tracking?)"
             )
@@ -127,6 +126,7 @@ class PoseCheck:
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
         """Compare a new keyframe with ``sources``, which see most of what it sees, the best first, and others, oldest
         first."""
+        self._measured = {_key(new), *self._measured.intersection(map(_key, keyframes))}
         near = [k for k in sources if not k.labelled][:PARTNERS]
         if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in near):
             near.append(keyframes[-1])
@@ -145,6 +145,17 @@ class PoseCheck:
         if recent > MAX_DISAGREEMENT or (contradicting or 0.0) > MAX_CONTRADICTING:
             self.warning = self._explain(recent, contradicting, [*keyframes, new])
             _log.warning("keyframes_contradict_each_other", seq=new.seq, camera=new.camera_id, reason=self.warning)
+
+    def compare_again(self, keyframes: Sequence[Keyframe]) -> None:
+        """Compare keyframes, oldest first, where a correction has moved them, in place of where they were."""
+        measured = self._measured
+        self._newest.clear()
+        self._pairs.clear()
+        self._moving.clear()
+        self.compared, self.worst, self.worst_contradicting, self.warning = 0, None, None, self._stands_still
+        for i, keyframe in enumerate(keyframes):
+            if _key(keyframe) in measured:
+                self.add(keyframe, (), keyframes[:i])
 
     def _compare_pairs(self, new: Keyframe, partners: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
         kept = {_key(k) for k in keyframes}

@@ -146,6 +146,11 @@ class Segmenter:
         self._counts[camera] += 1
         return Opinion(values[..., :-1], self._group, values[..., -1] >= MOVES)
 
+    def clear(self) -> None:
+        """Forget the answers: poses of frames to come are in another world."""
+        self._last.clear()
+        self._counts.clear()
+
     def _ask(self, rgb: UInt8, size: tuple[int, int]) -> Float32:
         """(h, w, G + 1) of an image (H, W, 3), at ``size``."""
         return self._likelihood(self._model.run(self._prepared(rgb)), size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +17,11 @@ from semantic_mapper.fields.checkpoint import streaming
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction import ALWAYS, PoseCorrection, PosePair
+from semantic_mapper.mapping.odometry_sessions import OdometrySessions
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
+from tests.mapping.test_segmenter import painted, write_model
 from tests.small import tiny_field, tiny_frames, tiny_pipeline
 
 
@@ -156,6 +159,37 @@ def test_keyframes_move_with_their_frames_and_anchors_of_another_recording_stay(
         assert new.encoded.feature is old.encoded.feature and new.depth_m is old.depth_m
         expected = np.linalg.inv(true[old.stamp_ns])[:3]
         np.testing.assert_allclose(new.encoded.T_camera_world[0], expected, atol=1e-6)
+
+
+def test_a_correction_leaves_nothing_that_is_known_by_old_poses(tmp_path: Path):
+    frames = [replace(f, depth_m=np.full_like(f.rgb[..., 0], 2, np.float32)) for f in map(painted, tiny_frames(2))]
+    aside = make_pose((0, 0, 0), (0.5, 0, 0))
+    moved = [replace(f, T_world_camera=frames[0].T_world_camera @ aside) for f in frames]
+    segmenter, moving = {"table": str(write_model(tmp_path))}, {"motion": False, "classes": True}
+    pipeline = make_pipeline(segmenter=segmenter, moving=moving)
+    (first,) = OdometrySessions(pipeline).take(frames[0]).ready
+    shown = pipeline.step(first).moving
+    pipeline.corrector.start({first.stamp_ns: moved[0].T_world_camera})
+    finish(pipeline)
+    assert pipeline.last_pose is not None and pipeline.last_pose.T_map_camera is not None
+    np.testing.assert_allclose(pipeline.last_pose.T_map_camera, moved[0].T_world_camera)
+    assert shown is not None and shown.any()
+    assert np.array_equal(pipeline.step(moved[1]).moving, shown)  # of this picture, not where the last one was
+
+
+def test_poses_that_contradicted_each_other_are_judged_where_a_correction_has_moved_them():
+    frames = tiny_frames(24)
+    wrong = [replace(f, T_world_camera=np.linalg.inv(f.T_world_camera)) for f in frames]
+    pipeline = mapped(wrong)
+    assert "poses inverted" in pipeline.pose_check.warning
+    compared = pipeline.pose_check.compared
+    pipeline.corrector.start({f.stamp_ns: f.T_world_camera for f in wrong})  # no better than they are
+    finish(pipeline)
+    assert "poses inverted" in pipeline.pose_check.warning and pipeline.pose_check.compared >= 0.8 * compared
+    pipeline.corrector.start(true_poses(frames, 1))
+    finish(pipeline)
+    worst = pipeline.pose_check.worst
+    assert not pipeline.pose_check.warning and worst is not None and worst < 0.01
 
 
 def test_later_frames_are_trusted_unless_their_odometry_goes_on_in_the_old_world():
