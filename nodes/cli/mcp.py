@@ -42,11 +42,12 @@ def mcp(
     must_be_there(*paths)
     snapshot, objects = open_objects(map_path(paths[0]))
     if since is None:
-        since_ns = min((o.first_seen_ns for o in objects), default=0)
+        since_ns = min((o.places[0].stamp_ns for o in objects), default=0)
         changes = changes_of(objects, since_ns)
     else:
         voxel_map, before = (VoxelMap.load(map_path(path)) for path in paths)
-        since_ns, changes = before.last_stamp_ns, changes_between(voxel_map, before)[0]
+        changes, before = changes_between(voxel_map, before)
+        since_ns = before.last_stamp_ns
         objects = ObjectMemory.from_bytes(voxel_map.objects).objects  # with the ids of the changes
     now = MapNow(snapshot, objects, up_in(snapshot), since_ns, changes)
     serve(lambda: now)

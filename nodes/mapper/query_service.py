@@ -320,7 +320,8 @@ class QueryService(Closing):
             things = tuple(thing for thing in self._tracker.find(snapshot, up).things if not thing.unsure)
             graph = tracker.update(snapshot, things)
             looks = Looks.of(self._map.places.places, memory.last_ns)
-            changed = snapshot.packed[snapshot.versions > self._map.objects_version] if len(memory) else None
+            later = snapshot.versions > (self._map.objects_version if len(memory) else -1)
+            changed = snapshot.packed[later], self._map.stamps_of(snapshot.versions[later])
             now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns, changed)
             memory.update(now, up, graph.room_of, before)
             self._map.objects, self._map.objects_version = memory.to_bytes(), snapshot.version

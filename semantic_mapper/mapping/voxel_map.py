@@ -53,6 +53,7 @@ from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int3
 _KERNEL_LOCK = threading.RLock()
 
 BLOCKS_A_VERSION = 256  # of a map that takes over another one
+MAX_STAMPS = 8192  # of frames that a map knows while it runs; of more, every second one is forgotten
 POINT_FIELDS = ("xyz", "rgb", "label", "confidence", "measured")
 
 
@@ -83,6 +84,7 @@ class VoxelMap:
         self.objects = b""
         self.objects_version = 0  # ``version`` that ``objects`` are of
         self.cleared = 0
+        self._stamps: list[tuple[int, int]] = []  # version and stamp of frames, of ever fewer the longer the run
         self._cleared_rows = NONE_CLEARED
         self._bounds = NO_BOUNDS  # of the last frame that cleared
         memory_bytes, blocks = int(config.memory_mb * 1e6), (config.initial_blocks, config.max_blocks)
@@ -183,6 +185,9 @@ class VoxelMap:
                     self._cleared_rows = self._cleared_rows.followed_by(rows_cleared)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
+            if len(self._stamps) >= MAX_STAMPS:
+                del self._stamps[::2]
+            self._stamps.append((self.version, frame.stamp_ns))
         return len(packed)
 
     @contextmanager
@@ -216,10 +221,16 @@ class VoxelMap:
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
-    def changed_keys(self, since: int) -> Int64:
-        """Packed keys (B,) of the blocks that have changed after a version, sorted."""
+    def changed_stamps(self, since: int) -> tuple[Int64, Int64]:
+        """Packed keys (B,) of the blocks that have changed after a version, sorted, and ``stamps_of`` each."""
         with _KERNEL_LOCK:
-            return self._grid.versions_since(since)[0]
+            packed, versions = self._grid.versions_since(since)
+        return packed, self.stamps_of(versions)
+
+    def stamps_of(self, versions: Int64) -> Int64:
+        """Stamps (N,) of the frames that made versions (N,), or of the next one of which it is known."""
+        known = np.array((*self._stamps, (2**62, self.last_stamp_ns)), np.int64)
+        return known[np.searchsorted(known[:, 0], versions), 1]
 
     def points(self, min_weight: float = SURFACE_WEIGHT, *, unknown_below: float | None = None) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order; 1 as ``min_weight`` = only what was

@@ -79,8 +79,8 @@ class MapObject:
     color: UInt8  # (3,) uint8 mean RGB of its surface
     signature: NDArray[np.int8] = field(repr=False)  # (SIGNATURE,) int8, what it looks like; see ``signature_of``
     points: NDArray[np.int16] = field(repr=False)  # (N, 3) int16 of its surface, millimetres from the box's centre
-    first_seen_ns: int
-    last_seen_ns: int  # stamp of the last update before which a part of it was seen again
+    first_seen_ns: int  # as ``last_seen_ns``, at the first update
+    last_seen_ns: int  # stamp of the last frame by which enough of it had been seen again
     views: int  # updates of the memory in which it was seen
     room: int | None  # where it is, or was last
     places: tuple[ObjectPlace, ...]  # where it was, the oldest first; the last is the present one
@@ -205,7 +205,7 @@ class ObjectMemory:
             moved = _refreshed(thing, now, j, up, rooms)
             place = ObjectPlace(stamp_ns, moved.box, moved.room)
             places = (*thing.places, place)[-MAX_PLACES:]
-            moved = replace(moved, places=places, missed=0, gone_ns=None, certainty=probability, last_seen_ns=stamp_ns)
+            moved = replace(moved, places=places, missed=0, gone_ns=None, certainty=probability)
             self._objects[thing.id] = moved
             left.add(thing.id)
             came.add(j)
@@ -291,11 +291,10 @@ class ObjectMemory:
         """Stamp of the last update; the least stamp of an empty memory."""
         return max((self._last_ns, *(thing.last_seen_ns for thing in self._objects.values())))
 
-    def moved_by(self, T_new_old: Float64) -> ObjectMemory:
-        """The same objects where the world is another one, at ``T_new_old`` (4, 4)."""
-        return ObjectMemory(
-            (_moved_by(thing, T_new_old) for thing in self._objects.values()), self._next_id, self._last_ns
-        )
+    def moved_by(self, T_new_old: Float64, later_ns: int = 0) -> ObjectMemory:
+        """The same objects where the world is another one, at ``T_new_old`` (4, 4), and stamps are later."""
+        moved = (_moved_by(thing, T_new_old, later_ns) for thing in self._objects.values())
+        return ObjectMemory(moved, self._next_id, self._last_ns + later_ns if self._objects else NEVER_NS)
 
     def join(self, other: ObjectMemory) -> None:
         """Take over the objects of another map of the same world. What is there in both, at one place and of one class,
@@ -387,7 +386,7 @@ def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph 
     except MapError:
         return None
     looks = Looks.of(voxel_map.places.places, memory.last_ns)
-    changed = voxel_map.changed_keys(voxel_map.objects_version) if len(memory) else None
+    changed = voxel_map.changed_stamps(voxel_map.objects_version if len(memory) else -1)
     now = MapVisit(snapshot, graph.things, looks, voxel_map.last_stamp_ns, changed)
     memory.update(now, graph.up, graph.room_of, before)
     voxel_map.objects, voxel_map.objects_version = memory.to_bytes(), snapshot.version
@@ -420,38 +419,51 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange
     the map of before, in the world of the later one.
 
     Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
-    ``before``; else it then remembers what this finds. Raises MapError: ``now`` is not later, the maps do not fit each
-    other, nobody knows how they lie, or it has no metres or no floor."""
-    since, ours, theirs = before.last_stamp_ns, *(ObjectMemory.from_bytes(m.objects) for m in (now, before))
-    if now.last_stamp_ns <= since:
-        raise MapError(f"the last frame of the map ({now.last_stamp_ns} ns) is not later than that of before ({since})")
+    ``before``; else it then remembers what this finds. Where stamps do not say that ``before`` is the earlier one, as
+    those that count from a robot's start, its stamps (and those of what it remembers) are set to before ``now``'s
+    first. Raises MapError: the maps do not fit each other, nobody knows how they lie, or it has no metres or no floor."""
+    ours, theirs = (ObjectMemory.from_bytes(m.objects) for m in (now, before))
     if len(theirs) and all((o := ours.get(t.id)) and o.first_seen_ns == t.first_seen_ns for t in theirs.objects):
-        return changes_of(ours.objects, since), before
+        return changes_of(ours.objects, before.last_stamp_ns), before
+    later_ns, T = 0, np.eye(4)
+    if now.last_stamp_ns <= before.last_stamp_ns:
+        first_ns = min((p.stamp_ns for p in now.places.places), default=now.last_stamp_ns)
+        later_ns = first_ns - 1 - before.last_stamp_ns
     if not shared_places(now.places.places, before.places.places):
         T = find_alignment(now, before).T_map_other
         aligned = VoxelMap(now.config, now.label_set)
         aligned.add(before, T)
-        before, theirs = aligned, theirs.moved_by(T)
-    now.objects, now.objects_version = theirs.to_bytes(), 0
+        before = aligned
+    before.last_stamp_ns += later_ns
+    now.objects, now.objects_version = theirs.moved_by(T, later_ns).to_bytes(), 0
     require_metres(now.scale_known, "changes")
     if remember(now, visit_of(before)) is None:
         raise MapError("changes: no floor was found, by which it is known which way is up")
-    return changes_of(ObjectMemory.from_bytes(now.objects).objects, since), before
+    return changes_of(ObjectMemory.from_bytes(now.objects).objects, before.last_stamp_ns), before
 
 
-def _moved_by(thing: MapObject, T: Float64) -> MapObject:
+def _moved_by(thing: MapObject, T: Float64, later_ns: int) -> MapObject:
     R = T[:3, :3]
 
     def moved(box: OrientedBox) -> OrientedBox:
         return OrientedBox(transform(T, box.center), box.size, R @ box.R_world_box)
 
-    places = tuple(replace(place, box=moved(place.box)) for place in thing.places)
-    return replace(thing, box=moved(thing.box), places=places, points=np.round(thing.points @ R.T).astype(np.int16))
+    places = tuple(replace(p, box=moved(p.box), stamp_ns=p.stamp_ns + later_ns) for p in thing.places)
+    return replace(
+        thing,
+        box=moved(thing.box),
+        places=places,
+        points=np.round(thing.points @ R.T).astype(np.int16),
+        first_seen_ns=thing.first_seen_ns + later_ns,
+        last_seen_ns=thing.last_seen_ns + later_ns,
+        gone_ns=None if thing.gone_ns is None else thing.gone_ns + later_ns,
+    )
 
 
 def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[int, int | None]) -> MapObject:
     """A thing of now as a new object."""
     thing, snapshot = now.things[j], now.snapshot
+    seen_ns = now.stamp_ns if (seen := now.seen_ns(thing)) is None else seen
     offsets = (sample_points(thing, snapshot, POINTS) - thing.box.center) * 1000
     room = rooms.get(thing.id)
     return MapObject(
@@ -463,8 +475,8 @@ def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[
         color=color_of(snapshot, thing),
         signature=signature_of(snapshot, thing, up),
         points=np.clip(np.round(offsets), -32767, 32767).astype(np.int16),
-        first_seen_ns=now.stamp_ns,
-        last_seen_ns=now.stamp_ns,
+        first_seen_ns=seen_ns,
+        last_seen_ns=seen_ns,
         views=1,
         room=room,
         places=(ObjectPlace(now.stamp_ns, thing.box, room),),
@@ -482,7 +494,7 @@ def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mappin
     names = {old.class_id: old.class_name, made.class_id: made.class_name}
     labels = now.snapshot.label_set
     best = made if made.seen >= old.seen else old
-    is_seen = now.sees(now.things[j])
+    seen_ns = now.seen_ns(now.things[j])
     place = ObjectPlace(old.places[-1].stamp_ns, made.box, made.room)
     return replace(
         made,
@@ -492,8 +504,8 @@ def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mappin
         signature=best.signature,
         color=best.color,
         first_seen_ns=old.first_seen_ns,
-        last_seen_ns=made.last_seen_ns if is_seen else old.last_seen_ns,
-        views=old.views + is_seen,
+        last_seen_ns=old.last_seen_ns if seen_ns is None else max(seen_ns, old.last_seen_ns),
+        views=old.views + (seen_ns is not None),
         places=(*old.places[:-1], place),
         appeared=old.appeared,
         certainty=old.certainty,

@@ -112,21 +112,25 @@ class Looks:
 
 
 class MapVisit(NamedTuple):
-    """A state of a map, its things, the views that it comes of, the stamp of the last frame, and packed keys (B,) of
-    blocks that have changed since the last update of the memory (None = all)."""
+    """A state of a map, its things, the views that it comes of, the stamp of the last frame, and packed keys (B,),
+    sorted, of the blocks that have changed since the last update of the memory, with the stamps (B,) of the frames that
+    changed each last (None = all blocks, by the last frame)."""
 
     snapshot: MapSnapshot
     things: Sequence[Instance]
     looks: Looks
     stamp_ns: int
-    changed: Int64 | None = None
+    changed: tuple[Int64, Int64] | None = None
 
-    def sees(self, thing: Instance) -> bool:
-        """Whether enough of a thing was seen since."""
+    def seen_ns(self, thing: Instance) -> int | None:
+        """Stamp of the last frame by which enough of a thing had been seen again; None where it was not seen since."""
         if self.changed is None:
-            return True
+            return self.stamp_ns
         keys = np.unique(pack_keys(thing.voxels >> 3))
-        return bool(np.isin(keys, self.changed).mean() >= LEAST_KNOWN)
+        row, there = find_sorted(self.changed[0], keys)
+        stamps = np.sort(self.changed[1][row[there]])
+        least = max(1, int(np.ceil(LEAST_KNOWN * len(keys))))
+        return int(stamps[-least]) if len(stamps) >= least else None
 
 
 class Evidence(NamedTuple):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
 from semantic_mapper.geometry import look_at
+from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.snapshot import MapMirror
@@ -155,6 +156,22 @@ def test_a_full_map_refuses_and_stays_usable() -> None:
     assert voxel_map.block_count == count and same(before, voxel_map.block_state())
     assert voxel_map.integrate(frame(seq=2), plane_depth(np.eye(4), (0, 0, 1), 0.8), sure(0), None) == count
     assert len(voxel_map.points().xyz) > 1000 and voxel_map.frames == 2
+
+
+def test_a_map_knows_which_frame_saw_a_block_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    voxel_map, away = small_map(), np.diag([-1.0, 1.0, -1.0, 1.0])
+    stamps = list[int]()
+    for seq, pose in enumerate((np.eye(4), away, away)):
+        posed = frame(pose, seq=seq)
+        voxel_map.integrate(posed, np.full((120, 160), 1.0, np.float32), sure(0), None)
+        stamps.append(posed.stamp_ns)
+    packed, seen = voxel_map.changed_stamps(0)
+    ahead = unpack_keys(packed)[:, 2] > 0
+    assert set(seen[ahead]) == {stamps[0]} and set(seen[unpack_keys(packed)[:, 2] < -1]) == {stamps[2]}
+    assert voxel_map.stamps_of(np.array([voxel_map.version + 5])) == stamps[2]
+    monkeypatch.setattr("semantic_mapper.mapping.voxel_map.MAX_STAMPS", 2)
+    voxel_map.integrate(frame(seq=9), np.full((120, 160), 1.0, np.float32), sure(0), None)
+    assert len(voxel_map._stamps) <= 3
 
 
 def test_same_frames_give_the_same_bits_on_one_thread_and_on_two() -> None:
