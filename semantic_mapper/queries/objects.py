@@ -312,10 +312,14 @@ class ObjectMemory:
                 self._next_id += 1
                 continue
             later = max(known, thing, key=lambda o: o.last_seen_ns)
+            earlier = min(known, thing, key=lambda o: o.first_seen_ns)
+            began = min(o.places[-1].stamp_ns for o in (known, thing))  # both have it at one place
             self._objects[known.id] = replace(
                 later,
                 id=known.id,
-                first_seen_ns=min(known.first_seen_ns, thing.first_seen_ns),
+                first_seen_ns=earlier.first_seen_ns,
+                appeared=earlier.appeared,
+                places=(*earlier.places[:-1], replace(later.places[-1], stamp_ns=began)),
                 views=known.views + thing.views,
                 missed=known.missed + thing.missed,
             )
@@ -420,8 +424,9 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange
 
     Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
     ``before``; else it then remembers what this finds. Where stamps do not say that ``before`` is the earlier one, as
-    those that count from a robot's start, its stamps (and those of what it remembers) are set to before ``now``'s
-    first. Raises MapError: the maps do not fit each other, nobody knows how they lie, or it has no metres or no floor."""
+    those that count from a robot's start, its stamps (and those of what it remembers) become ones before ``now``'s
+    first. Raises MapError: the maps do not fit each other, nobody knows how they lie, or no metres or floor are known.
+    """
     ours, theirs = (ObjectMemory.from_bytes(m.objects) for m in (now, before))
     if len(theirs) and all((o := ours.get(t.id)) and o.first_seen_ns == t.first_seen_ns for t in theirs.objects):
         return changes_of(ours.objects, before.last_stamp_ns), before

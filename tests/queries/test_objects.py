@@ -212,6 +212,34 @@ def test_merged_memories_have_what_is_in_both_once() -> None:
     np.testing.assert_allclose(desk.box.center, (1.5, 0.4, 0.45), atol=0.08)
 
 
+def test_ids_outlive_three_visits_saves_and_a_merge() -> None:
+    places = [((0.3, 0.3), (0.4, 2.3)), ((4.0, 2.0), (0.4, 2.3)), ((0.3, 0.3), (1.4, 0.4))]  # of the chest, the bench
+    houses = [[*two_rooms(), box(CHEST, *chest), box(BENCH, *bench)] for chest, bench in places]
+    memory, before, ids = ObjectMemory(), None, list[set[int]]()
+    for day, house in enumerate(houses, start=1):
+        now = visit(house, 10 * day)
+        memory.update(now, UP, before=before)
+        memory, before = ObjectMemory.from_bytes(memory.to_bytes()), now
+        ids.append({o.id for o in memory.objects})
+    other = ObjectMemory()
+    other.update(visit(houses[2], 40), UP)
+    memory.join(other)
+    assert ids == [{1, 2, 3}] * 3 and {o.id for o in memory.objects} == {1, 2, 3}
+    changes = changes_of(memory.objects, 20)
+    assert [c.kind for c in changes] == ["moved", "moved"] and len(memory.there) == 3
+    (table,) = {1, 2, 3} - {c.object.id for c in changes}
+    assert [o.views for o in memory.objects if o.id == table] == [4]
+
+
+def test_stamps_of_a_memory_are_shifted_together() -> None:
+    memory, _ = two_visits([*two_rooms(), box(BENCH, 0.4, 2.3)], two_rooms())
+    later = memory.moved_by(np.eye(4), later_ns=100)
+    kept, shifted = (
+        [(o.first_seen_ns, o.last_seen_ns, o.gone_ns, o.places[0].stamp_ns) for o in m.objects] for m in (memory, later)
+    )
+    assert shifted == [tuple(None if ns is None else ns + 100 for ns in row) for row in kept] and later.last_ns == 120
+
+
 def test_a_running_mapper_says_what_was_moved_since_the_map_that_it_goes_on_in() -> None:
     def saved(thing: Box, stamp_ns: int) -> VoxelMap:
         made = VoxelMap(VoxelMapConfig(voxel_size_m=VOXEL_M), LABELS)
