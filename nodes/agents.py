@@ -13,7 +13,7 @@ from semantic_mapper.geometry import look_at
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.plots import encode_picture
 from semantic_mapper.queries.find import EYE_M, FoundObject, find, picture_of, render, room_kinds
-from semantic_mapper.queries.objects import MapObject, ObjectChange, changes_of
+from semantic_mapper.queries.objects import MapObject, ObjectChange
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64, UInt8
 
@@ -37,9 +37,8 @@ class MapNow(NamedTuple):
 
 def read_live(client: MapClient) -> MapNow:
     """The map of a running mapper. Raises as ``MapClient.objects`` does."""
-    remembered, up = client.objects(), client.up()
-    changes = changes_of(remembered.objects, remembered.since_ns)
-    return MapNow(client.mirror().snapshot(), remembered.objects, up, remembered.since_ns, changes)
+    known, up = client.objects(), client.up()
+    return MapNow(client.mirror().snapshot(), known.objects, up, known.since_ns, known.changes)
 
 
 class MapTools:

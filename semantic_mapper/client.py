@@ -137,19 +137,22 @@ class MapClient(Closing):
             return snapshot, self._graphs.setdefault(key, GraphTracker(up))
 
     def objects(self, up: ArrayLike | None = None) -> RememberedObjects:
-        """What the map remembers of its things: their places, when they were seen, and those that have gone; brought up
-        to the present first. ``up`` (3,) is by default found by the floor. See ``queries.objects``."""
+        """What the map remembers of its things: their places, when they were seen, and those that have gone. It is
+        brought up to the present now and then, in some 3 % of the time: ``version`` says as of when this is. ``up``
+        (3,) is by default found by the floor. See ``queries.objects``."""
         return self._ask(questions.ObjectsRequest(up=None if up is None else _point(up, "up")))
 
     def find(
         self, phrase: str, *, limit: int = 5, up: ArrayLike | None = None, encoder: TextEncoder | None = None
     ) -> tuple[FoundObject, ...]:
-        """The objects that a phrase means ("red chair near the table"), the likeliest first, and poses to look from;
-        computed here, from ``objects`` and ``mirror``. An ``encoder`` scores names of things in the place of synonyms.
-        See ``queries.find``."""
-        axis = self.up() if up is None else up
-        objects = self.objects(up).objects
-        return find(phrase, self.mirror().snapshot(), objects, up=axis, limit=limit, encoder=encoder)
+        """The objects that a phrase means ("red chair near the table"), the likeliest first, and poses to look from; as
+        of what ``objects`` are. An ``encoder`` scores names of things in the place of synonyms, here, where the map is
+        then mirrored. See ``queries.find``."""
+        axis = None if up is None else _point(up, "up")
+        if encoder is None:
+            return self._ask(questions.FindRequest(phrase=phrase, limit=limit, up=axis))
+        objects, snapshot = self.objects(up).objects, self.mirror().snapshot()
+        return find(phrase, snapshot, objects, up=self.up() if up is None else up, limit=limit, encoder=encoder)
 
     def up(self) -> Float64:
         """Unit vector up (3,) in the world, found by the floor once; ``MapError`` where too little of it was seen."""

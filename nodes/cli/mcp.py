@@ -10,7 +10,8 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.agents import MapNow, read_live, serve
 from semantic_mapper.nodes.cli.verb import Remote, complete_launch, must_be_there, refuse_options, verb
 from semantic_mapper.queries.find import open_objects
-from semantic_mapper.queries.objects import ObjectMemory, changes_between, changes_of
+from semantic_mapper.queries.objects import ObjectMemory, changes_between
+from semantic_mapper.queries.questions import RememberedObjects
 from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.run_folder import map_path
 from semantic_mapper.transport.launches import is_running_mapper
@@ -42,8 +43,8 @@ def mcp(
     must_be_there(*paths)
     snapshot, objects = open_objects(map_path(paths[0]))
     if since is None:
-        since_ns = min((o.places[0].stamp_ns for o in objects), default=0)
-        changes = changes_of(objects, since_ns)
+        known = RememberedObjects.of_saved(objects)
+        since_ns, changes = known.since_ns, known.changes
     else:
         voxel_map, before = (VoxelMap.load(map_path(path)) for path in paths)
         changes, before = changes_between(voxel_map, before)

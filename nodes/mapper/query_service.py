@@ -26,16 +26,16 @@ from semantic_mapper.mapping.map_types import CameraPose
 from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
+from semantic_mapper.nodes.mapper.live_memory import LiveMemory
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.publishing import PartStatus
 from semantic_mapper.queries import questions
-from semantic_mapper.queries.graph import GraphTracker
+from semantic_mapper.queries.find import find
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at, nearest
-from semantic_mapper.queries.objects import ObjectMemory
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.questions import Request, encode_error
-from semantic_mapper.queries.revisit import Looks, MapVisit
+from semantic_mapper.queries.revisit import MapVisit
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, points_in_box
 from semantic_mapper.transport.endpoints import Closing
@@ -47,7 +47,6 @@ MAX_BLOCKS = 600  # copied between two frames, and the rest of a frame: bounds w
 LISTENED_S = 1.0  # without a question for so long, no more snapshots are made
 CATCH_UP_S = 4.0  # without another copy for so long, questions wait no longer for the present map
 MAX_WAITING, MAX_OF_CLIENT = 64, 8  # questions that wait, of all clients and of one
-MAX_UPS = 4  # directions up, by which rooms are kept
 # What would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
@@ -107,15 +106,13 @@ class QueryService(Closing):
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         self._tracker = InstanceTracker()
-        self._before = before
-        self._graphs: dict[questions.Point | None, GraphTracker] = {}  # by ``up``
-        self._remembered: tuple[object, questions.RememberedObjects] | None = None  # by version of the map and up
 
         self._copies: deque[CopiedChanges] = deque()  # on their way from the mapper's thread to that of the socket
         self._copied_version = 0
         self._copied_at = self._copy_again_at = 0.0  # monotonic seconds, as ``_listened_until``
         self._listened_until = 0.0
         self._awaited_version = 0  # that questions after a pause wait for
+        self._memory_version = -1  # that the next update of the memory waits for; -1 = it is not due
         self._pending: list[_PendingRequest] = []  # in order of arrival, until the answer is sent
         self._closed = threading.Event()
         self._broken = False  # no snapshot can be made, by a bug
@@ -123,6 +120,7 @@ class QueryService(Closing):
         self.answered = 0
         self._server = QueryServer(endpoint, keys=keys)
         self.endpoint = self._server.endpoint
+        self._memory = LiveMemory(voxel_map, before, lambda: self._tracker, self._server.wake)
         self._quick, self._long = (ThreadPoolExecutor(1, f"{lane} queries {endpoint}") for lane in ("quick", "long"))
         self._thread = threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True)
         self._thread.start()
@@ -135,19 +133,23 @@ class QueryService(Closing):
     def status(self) -> PartStatus:
         """For the mapper's status."""
         dead = "" if self.alive else "questions about the map are no longer answered; see the log"
-        return PartStatus({"answered": self.answered}, (dead,))
+        return PartStatus({"answered": self.answered, **self._memory.counters()}, (dead,))
 
     def follow(self) -> None:
         """Copy what has changed for the next snapshot; for the thread that changes the map, after each step. Costs
         nothing while nobody asks, and never waits."""
-        now, awaited = time.monotonic(), self._copied_version < self._awaited_version
+        awaited = self._copied_version < max(self._awaited_version, self._memory_version)
+        now = time.monotonic()
         wanted = awaited or self._copy_again_at <= now <= self._listened_until
         if wanted and not self._copies and self._copied_version != self._map.version and self.alive:
             self._copy(MAX_BLOCKS)
             self._copy_again_at = now + PERIOD_S
 
     def hand_over(self) -> None:
-        """Copy all that has changed, if there ever was a question; for before the map's thread does something long."""
+        """Copy all that has changed, if there ever was a question, and leave what the map remembers alone; for before
+        the map's thread does something long."""
+        self._memory_version = -1
+        self._memory.rest()
         if self._listened_until and self.alive and self._copied_version != self._map.version:
             self._copy(0)
 
@@ -158,6 +160,7 @@ class QueryService(Closing):
         self._closed.set()
         self._server.wake()
         self._thread.join()
+        self._memory.close()
         for worker in (self._quick, self._long):
             worker.shutdown(cancel_futures=True)
         self._server.close()
@@ -194,6 +197,16 @@ class QueryService(Closing):
             self._broken = True
             _log.exception("snapshot_failed", version=self._copies[0].result.version)
 
+    def _update_memory(self) -> None:
+        """Begin an update of what the map remembers, where one is due, once there is a snapshot of the present."""
+        if self._memory_version < 0 and self._memory.is_due():
+            self._memory_version, self._copied_at = self._map.version, max(self._copied_at, time.monotonic())
+        snapshot = self._mirror.snapshot()
+        late = self._broken or time.monotonic() > self._copied_at + CATCH_UP_S
+        if self._memory_version >= 0 and (late or snapshot.version >= self._memory_version):
+            self._memory_version = -1
+            self._memory.begin(snapshot)
+
     def _take(self, address: bytes, parts: list[bytes]) -> None:
         """Pass a question on to a worker, or let it wait for a snapshot."""
         try:
@@ -211,7 +224,7 @@ class QueryService(Closing):
             self._send(address, encode_error(MapError(_TOO_MANY)))
             return
         self._pending.append(_PendingRequest(address, until, parts, request))
-        if request.about_map:
+        if request.about_map and not request.of_memory:
             now = time.monotonic()
             if now > self._listened_until:  # after a pause, questions wait for a snapshot of the map as it is now
                 self._awaited_version, self._copied_at = self._map.version, now
@@ -230,12 +243,18 @@ class QueryService(Closing):
                 self._pending.remove(pending)
                 if (answer := pending.answer.result()) is not None:
                     self._send(pending.address, answer)
-                    if pending.request.about_map:
+                    if pending.request.about_map and not pending.request.of_memory:
                         self._listened_until = time.monotonic() + LISTENED_S
-            elif not (lags and pending.request.about_map):
+            elif self._may_answer(pending.request, lags=lags):
                 worker = self._long if self._takes_long(pending.request) else self._quick
                 pending.answer = worker.submit(self._answer, pending)
                 pending.answer.add_done_callback(lambda _: self._server.wake())
+        self._update_memory()
+
+    def _may_answer(self, request: Request[Any], *, lags: bool) -> bool:
+        if isinstance(request, questions.ObjectsRequest | questions.FindRequest):
+            return self._memory.ready(request.up)
+        return not (lags and request.about_map)
 
     def _takes_long(self, request: Request[Any]) -> bool:
         if not isinstance(request, questions.NearestRequest) or request.class_name in STUFF_NAMES:
@@ -251,9 +270,10 @@ class QueryService(Closing):
     def _answer(self, pending: _PendingRequest) -> list[bytes] | None:
         if time.monotonic() > pending.until:
             return None
-        request, snapshot = pending.request, self._mirror.snapshot()
+        request = pending.request
         name = questions.NAMES[type(request)]
         try:
+            snapshot = self._memory.last().snapshot if request.of_memory else self._mirror.snapshot()
             if request.about_map and self._map_is_busy and not snapshot.version:
                 raise MapError(_NOT_READY)
             state = questions.MapState(self.map_id, snapshot.version, snapshot.epoch)
@@ -285,7 +305,10 @@ class QueryService(Closing):
                 things += self._tracker.gone if request.gone else ()
                 return tuple(thing for thing in things if request.unsure or not thing.unsure)
             case questions.ObjectsRequest():
-                return self._remember(snapshot, request)
+                return self._memory.last().memory
+            case questions.FindRequest():
+                known = self._memory.last()
+                return find(request.phrase, snapshot, known.memory.objects, up=known.up, limit=request.limit)
             case questions.OccupancyRequest():
                 return occupancy(snapshot.with_moving(self._moving.points), request.points)
             case questions.DistanceRequest():
@@ -307,27 +330,6 @@ class QueryService(Closing):
                 return self._last_pose()
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
-
-    def _remember(self, snapshot: MapSnapshot, request: questions.ObjectsRequest) -> questions.RememberedObjects:
-        """What the map remembers, with what is there now; costs nothing while the map is the same."""
-        key = (snapshot.version, request.up)
-        if self._remembered is None or self._remembered[0] != key:
-            memory, before = ObjectMemory.from_bytes(self._map.objects), self._before
-            if request.up not in self._graphs and len(self._graphs) == MAX_UPS:
-                self._graphs.clear()
-            tracker = self._graphs.setdefault(request.up, GraphTracker(request.up))
-            up = tracker.up_in(snapshot)
-            things = tuple(thing for thing in self._tracker.find(snapshot, up).things if not thing.unsure)
-            graph = tracker.update(snapshot, things)
-            looks = Looks.of(self._map.places.places, memory.last_ns)
-            later = snapshot.versions > (self._map.objects_version if len(memory) else -1)
-            changed = snapshot.packed[later], self._map.stamps_of(snapshot.versions[later])
-            now = MapVisit(snapshot, things, looks, self._map.last_stamp_ns, changed)
-            memory.update(now, up, graph.room_of, before)
-            self._map.objects, self._map.objects_version = memory.to_bytes(), snapshot.version
-            since_ns = 0 if before is None else before.stamp_ns
-            self._remembered = key, questions.RememberedObjects(memory.objects, since_ns)
-        return self._remembered[1]
 
 
 def _encode_error(error: SemanticMapperError | MemoryError) -> list[bytes]:

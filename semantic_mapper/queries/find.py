@@ -35,6 +35,7 @@ COLOR_LIGHTNESS, COLOR_SPREAD = 0.7, 12.0  # weight of lightness, which light ch
 LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
 SHADE_SPREAD = 8.0  # CIELAB lightness
 SIZE_SPREAD = 0.12  # logarithm of a ratio of lengths
+LENGTHS, LIKELY = ("size", "height", "length"), 0.5  # of ``_sizes``; of the best probability, to be the largest of all
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
 ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
 TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
@@ -67,7 +68,9 @@ def find(
     """The objects of a map that a phrase means, at most ``limit``, the likeliest first; see ``queries.phrase``.
 
     The day of times without a date is that of the last object seen. ``up``, (3,) in the world, is by default found by
-    the floor. Raises MapError: as of ``read_phrase``, or nobody knows which way is up."""
+    the floor. Raises MapError: as of ``read_phrase``, a limit below 1, or nobody knows which way is up."""
+    if limit < 1:
+        raise MapError(f"find: limit is {limit}, at least 1 answer is found")
     axis = up_in(snapshot) if up is None else check_up(up)
     now_ns = max((o.last_seen_ns for o in objects), default=0)
     phrase = read_phrase(text, snapshot.label_set, now_ns, encoder)
@@ -87,7 +90,10 @@ def find(
         name = f"{relation} {noun.text}"
         found = [(p * fit, n, parts | {name: fit}) for (p, n, parts), fit in zip(found, fits, strict=True)]
         found = [answer for answer in found if answer[0] >= LEAST_PROBABILITY]
-    best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[: max(limit, 0)]
+    fits = scene.most(phrase.thing, [objects[n] for _, n, _ in found], [p for p, _, _ in found])
+    if any(abs(sign) == 2 for _, sign in phrase.thing.sizes):
+        found = [(p * fit, n, parts | {"most": fit}) for (p, n, parts), fit in zip(found, fits, strict=True)]
+    best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[:limit]
     return tuple(
         FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
         for p, n, parts in best
@@ -133,10 +139,20 @@ class _Scene:
                 usual = np.mean([_colors()[name][:, 0].mean() for name in noun.colors])
                 parts["shade"] = _soft(noun.shade * (_lab(thing.color)[0] * self._gain - usual) / SHADE_SPREAD)
         for what, sign in noun.sizes:
-            median = self._medians.get(thing.class_id)
-            k = ("size", "height", "length").index(what)
-            parts[what] = 0.5 if median is None else _soft(sign * (_sizes(thing)[k] - median[k]) / SIZE_SPREAD)
+            if abs(sign) == 1:
+                median = self._medians.get(thing.class_id, _sizes(thing))
+                parts[what] = _soft(sign * (_sizes(thing) - median)[LENGTHS.index(what)] / SIZE_SPREAD)
         return parts
+
+    def most(self, noun: NounPhrase, things: Sequence[MapObject], probabilities: Sequence[float]) -> list[float]:
+        """How well things are what a noun wants the most or least of, among the likely ones of them."""
+        fits, least = np.ones(len(things)), LIKELY * max(probabilities, default=0.0)
+        for what, sign in noun.sizes:
+            if abs(sign) == 2 and len(things):
+                length = np.array([np.sign(sign) * _sizes(o)[LENGTHS.index(what)] for o in things])
+                most = length[np.array(probabilities) >= least].max()
+                fits *= np.exp(np.minimum(length - most, 0) / SIZE_SPREAD)
+        return fits.tolist()
 
     def kind(self, room: int | None) -> str | None:
         """Likeliest kind of a room."""
@@ -152,8 +168,9 @@ class _Scene:
     def related(self, things: Sequence[MapObject], relation: str, noun: NounPhrase) -> list[float]:
         """How well things stand in a relation to any other that fits a noun."""
         found = self._touch(things, relation, noun)
-        fits = [(o, float(np.prod(list(self.looks(o, noun).values())))) for o in self._there]
-        for other, fit in [of for of in fits if of[1] >= LEAST_PROBABILITY]:
+        fits = [float(np.prod(list(self.looks(o, noun).values()))) for o in self._there]
+        fits = [fit * most for fit, most in zip(fits, self.most(noun, self._there, fits), strict=True)]
+        for other, fit in [of for of in zip(self._there, fits, strict=True) if of[1] >= LEAST_PROBABILITY]:
             for n, thing in enumerate(things):
                 reach = np.linalg.norm(thing.box.size) / 2 + np.linalg.norm(other.box.size) / 2 + 2 * NEAR_M
                 near = other.id != thing.id and np.linalg.norm(thing.box.center - other.box.center) < reach

@@ -22,9 +22,10 @@ from semantic_mapper.errors import CodecError, SemanticMapperError, TransportErr
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, CorrectionStatus, MapPoints
+from semantic_mapper.queries.find import FoundObject
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
-from semantic_mapper.queries.objects import MapObject
+from semantic_mapper.queries.objects import MapObject, ObjectChange, changes_of
 from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.surface import RayHits
 from semantic_mapper.transport.codec import check_header, pack_header, unpack_header
@@ -60,6 +61,7 @@ class Request(Wire, Generic[AnswerT], frozen=True, kw_only=True):
 
     takes_long: ClassVar[bool] = False  # more than a few milliseconds
     about_map: ClassVar[bool] = True  # answered from a snapshot, which has to be up to date
+    of_memory: ClassVar[bool] = False  # or as of the last update of what the map remembers
 
     asker: Word = ""
     waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
@@ -142,11 +144,20 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RememberedObjects:
-    """What a map remembers of its things, and the last stamp of the map that it goes on in (0 = of none): what came of
-    them since is ``queries.objects.changes_of``."""
+    """What a map remembers of its things, and the last stamp of the map that it goes on in (0 = of none)."""
 
     objects: tuple[MapObject, ...]
     since_ns: int
+
+    @classmethod
+    def of_saved(cls, objects: tuple[MapObject, ...]) -> "RememberedObjects":
+        """Of a saved map, since its first visit."""
+        return cls(objects, min((o.places[0].stamp_ns for o in objects), default=0))
+
+    @property
+    def changes(self) -> tuple[ObjectChange, ...]:
+        """What has become of them since, the surest first."""
+        return changes_of(self.objects, self.since_ns) if self.since_ns else ()
 
 
 class InfoRequest(Request[MapInfo], frozen=True, kw_only=True):
@@ -199,6 +210,17 @@ class ObjectsRequest(Request[RememberedObjects], frozen=True, kw_only=True):
     """What the map remembers of its things; ``up`` (3,), None = by the floor."""
 
     takes_long: ClassVar[bool] = True
+    of_memory: ClassVar[bool] = True
+    up: Point | None = None
+
+
+class FindRequest(Request[tuple[FoundObject, ...]], frozen=True, kw_only=True):
+    """The objects that a phrase means; see ``find.find``. ``up`` as of ``ObjectsRequest``."""
+
+    takes_long: ClassVar[bool] = True
+    of_memory: ClassVar[bool] = True
+    phrase: Sentence
+    limit: int = 5
     up: Point | None = None
 
 
@@ -273,6 +295,7 @@ QUESTIONS = {
     "points_in_box": Question(BoxRequest, MapPoints),
     "instances": Question(InstancesRequest, tuple[Instance, ...]),
     "objects": Question(ObjectsRequest, RememberedObjects),
+    "find": Question(FindRequest, tuple[FoundObject, ...]),
     "occupancy": Question(OccupancyRequest, UInt8),
     "distance_field": Question(DistanceRequest, DistanceField),
     "changes": Question(ChangesRequest, BlockChanges),

@@ -8,6 +8,7 @@ import numpy as np
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import CameraPose, MapPoints
+from semantic_mapper.queries.find import FoundObject
 from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.objects import MapObject, ObjectPlace
@@ -113,6 +114,7 @@ def questions() -> dict[str, dict[str, Any]]:
         "points_in_box": {**who, **box},
         "instances": {**who, "up": (0.0, 0.0, 1.0)},
         "objects": {**who, "up": (0.0, 0.0, 1.0)},
+        "find": {**who, "phrase": "red chair", "limit": 3, "up": None},
         "occupancy": {**who, "points": points},
         "pose": who,
         "distance_field": {**who, **box, "unknown_is_occupied": True},
@@ -183,6 +185,7 @@ def answers() -> dict[str, Any]:
         "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
         "instances": (thing,),
         "objects": RememberedObjects((remembered,), 5),
+        "find": (FoundObject(remembered, 0.5, {"class": 0.75, "color": 0.5}, "kitchen", np.eye(4)),),
         "occupancy": u8 % 3,
         "pose": CameraPose("rooms", 7, np.eye(4)),
         "distance_field": DistanceField(np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3),

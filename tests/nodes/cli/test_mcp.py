@@ -93,8 +93,10 @@ def test_an_agent_finds_things_goals_and_pictures_in_a_saved_map(tmp_path: Path)
 
 def test_an_agent_asks_a_running_mapper() -> None:
     with a_folder() as folder, answering(f"ipc://{folder / 'q'}", house(10)) as service:
-        _, (found, changes) = call([("find", {"phrase": "table"}), ("what_changed", {})], service.endpoint)
-    assert [a["class"] for a in found["answers"]] == ["table"] and changes["changes"] == []
+        calls: Calls = [("find", {"phrase": "table"}), ("find", {"phrase": "table", "limit": 0}), ("what_changed", {})]
+        _, (found, none, changes) = call(calls, service.endpoint)
+    assert [a["class"] for a in found["answers"]] == ["table"]
+    assert "limit is 0" in none.text and "no map of before" in changes.text
 
 
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
