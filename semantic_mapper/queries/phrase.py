@@ -24,7 +24,12 @@ ROOM_KINDS: Mapping[str, Mapping[str, float]] = _WORDS["room_kinds"]
 RELATIONS: Mapping[str, str] = _WORDS["relations"]
 OTHER_WEIGHT = 0.15  # of a class of many kinds of things, for a word that means one of them
 _COLORS = {w: name for name, words in _WORDS["color_synonyms"].items() for w in words.split()} | {c: c for c in COLORS}
-_SIZES = {w: (key.strip("-"), -1 if key[0] == "-" else 1) for key, ws in _WORDS["sizes"].items() for w in ws.split()}
+_SIZES = {
+    word: (key.strip("-"), -step if key[0] == "-" else step)
+    for table, step in (("sizes", 1), ("superlatives", 2))
+    for key, words in _WORDS[table].items()
+    for word in words.split()
+}
 _SHADES = {word: 1 if name == "light" else -1 for name, words in _WORDS["shades"].items() for word in words.split()}
 _KINDS = {name.replace(" ", ""): name for name in ROOM_KINDS}
 _KINDS |= {word: name for name, words in _WORDS["room_synonyms"].items() for word in words.split()}
@@ -50,7 +55,8 @@ class NounPhrase:
     text: str
     classes: Mapping[int, float]  # class id -> how well the words mean it, above 0, at most 1
     colors: tuple[str, ...] = ()  # of ``COLORS``
-    sizes: tuple[tuple[str, int], ...] = ()  # "size", "height" or "length"; 1 = more of it than usual, -1 = less
+    # "size", "height" or "length"; 1 = more of it than usual, -1 = less, 2 = the most of all that fit, -2 = the least
+    sizes: tuple[tuple[str, int], ...] = ()
     shade: int = 0  # of the colours: 1 = light, -1 = dark, 0 = any
 
 
@@ -85,8 +91,10 @@ def read_phrase(text: str, labels: LabelSet, now_ns: int, encoder: TextEncoder |
         kind = _KINDS.get("".join(what)) if word == "in" else None
         if room or kind:
             rooms.append(int(room[1]) if room else kind or "")
-        elif what:  # nothing: "where is the cup at"
+        elif what:
             relations.append((_RELATIONS[word], _read_noun(what, labels, nouns, encoder)))
+        elif word != "at":  # "where is the cup at"
+            raise MapError(f"find: '{word}' needs a thing{' or a room' * (word == 'in')} behind it")
     thing = _read_noun([w for w in first.split() if w not in _FILLER], labels, nouns, encoder)
     return Phrase(thing, tuple(relations), tuple(rooms), after_ns, before_ns)
 
@@ -181,6 +189,7 @@ def _moment(found: re.Match[str], now_ns: int) -> tuple[int, int]:
         hour, _, minute = re.sub(r" ?[ap]m", "", {"noon": "12", "midnight": "0"}.get(clock, clock)).partition(":")
         half = 12 * (clock.endswith("pm") - (clock[-1] == "m" and hour == "12"))
         at = at.replace(hour=int(hour) + half, minute=int(minute or 0))
+        at += timedelta(days=clock == "midnight" and found["when"] in ("before", "until"))  # the end of the day
     except (ValueError, OverflowError) as error:
         raise MapError(f"find: '{found[0].strip()}' is no time: {error}") from error
     return _stamp(at), _stamp(at + timedelta(minutes=1))

@@ -23,6 +23,7 @@ from semantic_mapper.queries.revisit import SIGNATURE
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float32, Float64
 from tests.nodes.mapper.test_query_service import a_folder, answering
+from tests.nodes.support import run_ok
 from tests.queries.house import LABELS, TRUNCATION, VOXEL_M, house_changes, two_rooms
 
 UP = np.array((0.0, 0.0, 1.0))
@@ -96,6 +97,8 @@ def test_a_phrase_is_a_thing_its_looks_relations_and_rooms(text: str, classes: s
     [
         ("chair last seen before noon", None, at(12)),
         ("chair seen after 3 pm", at(15), None),
+        ("chair seen before midnight", None, at(0, day=6)),
+        ("chair seen after midnight", at(0), None),
         ("chair last seen since yesterday 9:30 and before 8:05am", at(9, 30, day=4), at(8, 5)),
         ("chair seen yesterday", at(0, day=4), at(0)),
         ("chair seen on 2026-03-02", at(0, day=2), at(0, day=3)),
@@ -119,6 +122,8 @@ def test_times_are_local_and_of_the_day_of_the_map(text: str, after: int | None,
         ("the red", "names no thing"),
         ("", "names no thing"),
         ("chair not in the kitchen", "'not' cannot be answered"),
+        ("chair near", "'near' needs a thing behind it"),
+        ("chair in the", "'in' needs a thing or a room behind it"),
         ("chair seen after 25:00", "is no time"),
         ("chair seen on 9999-12-31", "is no time"),
         ("the dark chair", "'dark' is not known"),
@@ -191,6 +196,9 @@ KITCHEN = [
         ("red chair in the bathroom", 3, {3, 1}),
         ("gray chair in room 1", 2, {2}),
         ("tall chair", 3, {3, 1, 2}),
+        ("the largest chair", 3, {3, 1, 2}),
+        ("smallest chair in the bathroom", 3, {3, 1, 2}),
+        ("object on the smallest table", 6, {6}),
         ("chair near the table", 3, {3}),
         ("chair near the fridge", 2, {2}),
         ("object on the table", 6, {6}),
@@ -270,6 +278,12 @@ def test_a_running_mapper_finds_what_its_saved_map_has(tmp_path: Any) -> None:
     now.save(tmp_path / "map.npz")
     snapshot, objects = open_objects(tmp_path / "map.npz")
     (saved,) = find("table in room 2 on the floor", snapshot, objects)
+    folder, mine = tmp_path / "found", tmp_path / "found" / "my_object_1.png"
+    folder.mkdir()
+    for old in (mine, folder / "5_object_9.png"):
+        old.touch()
+    run_ok("query", tmp_path / "map.npz", "find", "table", "--pictures", folder)
+    assert set(folder.iterdir()) == {mine, folder / f"1_object_{saved.object.id}.png"}, "none of an earlier answer"
     with (
         a_folder() as folder,
         answering(f"ipc://{folder / 'q'}", now) as service,
