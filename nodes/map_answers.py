@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import scale_name
 from semantic_mapper.queries.find import FoundObject
@@ -13,6 +14,7 @@ from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.objects import ObjectChange, ObjectPlace
 from semantic_mapper.queries.occupancy import State
+from semantic_mapper.queries.questions import RememberedObjects
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Float64
@@ -89,7 +91,13 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
 
 
 def answer_changes(since_ns: int, changes: Sequence[ObjectChange]) -> dict[str, Any]:
-    """What was moved, is new, or has gone after a stamp, the surest first."""
+    """What was moved, is new, or has gone after a stamp, the surest first. Raises MapError: the stamp is 0, since there
+    is no map of before."""
+    if not since_ns:
+        raise MapError(
+            "changes: there is no map of before; `up --set map=FILE` goes on in one, and --since names that of a saved "
+            "map"
+        )
     return {
         "question": "changes",
         "since_ns": since_ns,
@@ -128,6 +136,24 @@ def answer_find(phrase: str, answers: Sequence[FoundObject]) -> dict[str, Any]:
         for answer in answers
     ]
     return {"question": "find", "phrase": phrase, "answers": found}
+
+
+def describe_memory(memory: RememberedObjects) -> list[dict[str, Any]]:
+    """All objects that a map remembers, by id, with what has become of each."""
+    kinds = {change.object.id: change.kind for change in memory.changes}
+    return [
+        {
+            "id": o.id,
+            "class": o.class_name,
+            "probability": round(o.probability, DIGITS),
+            "first_seen_ns": o.first_seen_ns,
+            "last_seen_ns": o.last_seen_ns,
+            "gone_ns": o.gone_ns,
+            "change": kinds.get(o.id),
+            "places": [_describe_place(place) for place in o.places],
+        }
+        for o in memory.objects
+    ]
 
 
 def _describe_place(place: ObjectPlace) -> dict[str, Any]:

@@ -8,8 +8,10 @@ from typing import Any, Self
 import numpy as np
 import structlog
 
+from semantic_mapper.client import MapClient
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.queries.objects import ObjectChange
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import UInt8
 
@@ -63,6 +65,22 @@ class MapFollower:
                 if not (self.trouble or ended):
                     _log.warning("map_not_shown", reason=str(error))
                 self.trouble, pause_s = str(error), 0.0
+
+
+def follow_changes(client: MapClient) -> Callable[[], tuple[ObjectChange, ...]]:
+    """What gives the changes since the map that a mapper goes on in, as ``MapClient.objects`` does; of one that goes on
+    in none it asks but once."""
+    goes_on = True
+
+    def changes() -> tuple[ObjectChange, ...]:
+        nonlocal goes_on
+        if not goes_on:
+            return ()
+        memory = client.objects()
+        goes_on = memory.since_ns > 0
+        return memory.changes
+
+    return changes
 
 
 def thinning(count: int) -> int:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT, TOP = 1600, 860, 100
-COLORS = {"moved": "#ffd21f", "new": "#3fe07f", "gone": "#ff5a4f"}
 
 
 @plots.rendered
@@ -37,7 +36,7 @@ def draw_changes(
         for points, inside in zip((before, now), shown, strict=True)
     ]
     camera = fitted(np.concatenate(views), size)
-    counts = {kind: sum(c.kind == kind for c in changes) for kind in COLORS}
+    counts = {kind: sum(c.kind == kind for c in changes) for kind in plots.CHANGE_COLORS}
     figure = plots.new_figure(WIDTH, HEIGHT)
     plots.put_title(figure, title, ", ".join(f"{count} {kind}" for kind, count in counts.items()))
 
@@ -54,7 +53,7 @@ def draw_changes(
             place = (old, new)[column]
             if place is None:
                 continue
-            color = COLORS[change.kind]
+            color = "#" + bytes(plots.CHANGE_COLORS[change.kind]).hex()
             _put_box(axes, pixels(_corners(place.box)), str(change.object.id), color)
             if column and change.kind == "moved" and old is not None:
                 start, end = pixels(np.stack((old.box.center, place.box.center)))

@@ -21,9 +21,10 @@ from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
-from semantic_mapper.plots import UNKNOWN
+from semantic_mapper.plots import CHANGE_COLORS, UNKNOWN
 from semantic_mapper.queries.graph import HUNG_NAMES, Room, SceneGraph
 from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.objects import MapObject, ObjectChange
 from semantic_mapper.replay.exporters.base import CameraPath
 from semantic_mapper.replay.rerun_layout import (
     CEILING,
@@ -163,10 +164,11 @@ class RerunLog:
         legend = draw_map_legend(points.label, self._label_set, computed)
         self._stream.log("legend", rr.Image(legend))
 
-    def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = ()) -> None:
+    def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = (), changes: Sequence[ObjectChange] = ()) -> None:
         """Rooms, doors and things of the map as it is now, in the view that is coloured by class.
 
-        Where things were that are ``gone`` is drawn in grey, with the stamp of when they went.
+        Where things were that are ``gone`` is drawn in grey, with the stamp of when they went; ``changes`` since the
+        map of before have their own colours, and what was moved an arrow.
         """
         self._up = graph.up
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
@@ -192,11 +194,19 @@ class RerunLog:
         left = [f"{thing.title}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
         self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
 
+        colors = [CHANGE_COLORS[change.kind] for change in changes]
+        names = [f"{c.object.class_name} {c.object.id}: {c.kind}" for c in changes]
+        self._log_boxes("changes", [c.object for c in changes], colors=colors, labels=names, show_labels=True)
+        ways = [(c.before.box.center, c.object.box.center) for c in changes if c.kind == "moved" and c.before]
+        starts, ends = np.array(ways).reshape(-1, 2, 3).transpose(1, 0, 2)
+        arrows = rr.Arrows3D(origins=starts, vectors=ends - starts, radii=DOT_RADIUS_M, colors=CHANGE_COLORS["moved"])
+        self._stream.log("world/graph/moves", arrows)
+
     def _log_names(self, entity: str, xyz: Float64, names: Sequence[str], colors: Any) -> None:
         shown = rr.Points3D(xyz, radii=DOT_RADIUS_M, colors=colors, labels=names, show_labels=True)
         self._stream.log(entity, shown)
 
-    def _log_boxes(self, name: str, things: Sequence[Instance], **look: Any) -> None:
+    def _log_boxes(self, name: str, things: Sequence[Instance | MapObject], **look: Any) -> None:
         boxes = [thing.box for thing in things]
         turns = [Rotation.from_matrix(box.R_world_box).as_quat() for box in boxes]
         self._stream.log(

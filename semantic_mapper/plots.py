@@ -36,6 +36,7 @@ LegendRow = tuple[str, Color, float | None]  # class, colour, fraction of the ma
 BACKGROUND, PANEL, GRID = (22, 25, 31), (31, 35, 43), (62, 68, 79)
 TEXT, DIM_TEXT = (234, 237, 242), (172, 180, 192)
 UNKNOWN = (112, 116, 122)
+CHANGE_COLORS = {"moved": (255, 210, 31), "new": (63, 224, 127), "gone": (255, 90, 79)}  # of things
 CYCLE = ("#56b4e9", "#e69f00", "#2fbf94", "#e28fc0", "#f0e442", "#e8743b", "#c9cdd3")  # after Okabe and Ito, lighter
 TITLE_PT, TEXT_PT, SMALL_PT = 14, 11, 9.5
 _DPI = 100

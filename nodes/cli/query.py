@@ -18,7 +18,7 @@ from semantic_mapper.config import AtLeastOne, Fraction, nearest_path
 from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError, TransportError
 from semantic_mapper.labels import PLAIN_NAMES
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.map_file import describe_map
+from semantic_mapper.mapping.map_file import describe_map, open_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
@@ -40,8 +40,9 @@ from semantic_mapper.queries.find import find, open_objects, picture_of
 from semantic_mapper.queries.graph import GraphTracker, draw_graph
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.nearest import MAX_RADIUS_VOXELS, at, nearest
-from semantic_mapper.queries.objects import changes_between, changes_of
+from semantic_mapper.queries.objects import ObjectMemory, changes_between
 from semantic_mapper.queries.phrase import has_date
+from semantic_mapper.queries.questions import RememberedObjects
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import up_in
 from semantic_mapper.replay.changes_picture import draw_changes
@@ -143,6 +144,9 @@ def query(
         with client as world_map:
             values = (question, name, point, axis, min_confidence, gone, unsure, picture)
             found = {"map": source, **answer(world_map, *values)}
+            if question == "graph":
+                memory = _saved_memory(source) if isinstance(world_map, MapSnapshot) else world_map.objects(axis)
+                found["remembered"] = map_answers.describe_memory(memory)
         output.print(answer_table(found))
         if found.get("found") is False and not unsure:
             output.print("nothing is certain enough to be listed; --unsure lists all candidates")
@@ -199,8 +203,7 @@ def answer(
         case "changes":
             assert not saved  # see ``_saved_changes``
             remembered = world_map.objects(up)
-            changes = changes_of(remembered.objects, remembered.since_ns)
-            return map_answers.answer_changes(remembered.since_ns, changes)
+            return map_answers.answer_changes(remembered.since_ns, remembered.changes)
         case _:  # the graph
             graph = GraphTracker(up).update(world_map) if saved else world_map.graph(up)
             if picture is not None and graph.floors:
@@ -221,23 +224,32 @@ def _saved_changes(source: str, since: Path | None, picture: Path | None) -> dic
     return map_answers.answer_changes(before.last_stamp_ns, changes)
 
 
+def _saved_memory(source: str) -> RememberedObjects:
+    with open_map(map_path(Path(source))) as reader:
+        return RememberedObjects.of_saved(ObjectMemory.from_bytes(reader.objects()).objects)
+
+
 def _find(
     source: str, phrase: str, up: Up | None, pictures: Path | None, remote: Remote, *, live: bool
 ) -> dict[str, Any]:
     """What a phrase means, in a saved map or that of a running mapper, with a picture of each answer."""
     if live:
         with MapClient(source, server=remote.server, keys=remote.keys) as client:
-            answers, snapshot, axis = client.find(phrase, up=up), client.mirror().snapshot(), up or client.up()
+            answers = client.find(phrase, up=up)
+            snapshot = None if pictures is None else client.mirror().snapshot()
     else:
         must_be_there(Path(source))
         snapshot, objects = open_objects(map_path(Path(source)))
-        axis = up or up_in(snapshot)
-        answers = find(phrase, snapshot, objects, up=axis)
+        answers = find(phrase, snapshot, objects, up=up)
     found = map_answers.answer_find(phrase, answers)
-    for number, answer in enumerate(answers if pictures is not None else (), start=1):
-        assert pictures is not None
+    for old in () if pictures is None else pictures.glob("[0-9]_object_[0-9]*.png"):
+        old.unlink()  # of an earlier answer
+    if pictures is None or snapshot is None or not answers:
+        return found
+    axis = np.array(up_in(snapshot) if up is None else up)
+    for number, answer in enumerate(answers, start=1):
         path = pictures / f"{number}_object_{answer.object.id}.png"
-        write_picture(path, picture_of(snapshot, answer, np.array(axis)))
+        write_picture(path, picture_of(snapshot, answer, axis))
         found["answers"][number - 1]["picture"] = str(path)
     return found
 

@@ -38,9 +38,9 @@ def view(
     """Show a running launch or a saved map in a browser.
 
     Images, rendered semantics, depth, the camera's path, the map and stage times are shown. The map has a tab for each
-    colouring: class, camera colour, confidence, and age: how long ago its surroundings last changed (a saved map has
-    none). Of a log: `map --view`. The page is served on this machine alone, and asks no other; to see it from another
-    one, tunnel both ports.
+    colouring: class, camera colour, confidence, and whether a sensor measured it. Boxes and arrows show what was moved,
+    is new or has gone since the map of before. Of a log: `map --view`. The page is served on this machine alone, and
+    asks no other; to see it from another one, tunnel both ports.
 
     With --status, twice a second: states, restarts, memory, rates, ages and losses of each node. frame: time since the
     last one; age: of the last one when it was mapped; beat: since the last sign of life. A launch on another machine is

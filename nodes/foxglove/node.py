@@ -19,7 +19,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, MapError, NodeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import SCALE_FIX
-from semantic_mapper.nodes.map_feed import MapFollower, describe_map, thinned
+from semantic_mapper.nodes.map_feed import MapFollower, describe_map, follow_changes, thinned
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.nodes.publishing import PartStatus, StatusReport
@@ -124,6 +124,7 @@ class _MapSender:
         self._server = server
         self._labels: LabelSet | None = None
         self._graphs: tuple[MapMirror, GraphTracker] | None = None
+        self._changes = follow_changes(client)
         self._shown: dict[Subject, tuple[int, NDArray[np.int64]]] = {}  # to how many, and contents of the blocks
 
     def look(self) -> None:
@@ -151,12 +152,12 @@ class _MapSender:
 
     def _send_graph(self, tracker: GraphTracker, snapshot: MapSnapshot) -> None:
         try:
-            graph = tracker.update(snapshot)
+            graph, changes = tracker.update(snapshot), self._changes()
         except MapError as error:  # which way is up shows once there is a floor
             self.no_graph = f"no graph: {error}"
             return
         self.no_graph = "" if graph.floors else "no graph: no floor was found"
-        self._server.send_graph(graph, self.stamp_ns)
+        self._server.send_graph(graph, changes, self.stamp_ns)
         self.sent["graph"] += 1
 
     def _use_labels(self, label_set: LabelSet) -> None:

@@ -18,9 +18,10 @@ from semantic_mapper.errors import DependencyError, TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.map_feed import POINT, pack_points
-from semantic_mapper.plots import class_colors
+from semantic_mapper.plots import CHANGE_COLORS, class_colors
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.objects import ObjectChange
 from semantic_mapper.replay.exporters.base import CameraPath, quaternion
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.transport.messages import Status
@@ -182,10 +183,10 @@ class FoxgloveServer(Closing):
         if self._info.has_sinks():
             self._info.log(about, log_time=when)
 
-    def send_graph(self, graph: SceneGraph, stamp_ns: int) -> None:
-        """Floors, rooms, doors and things as they are now."""
+    def send_graph(self, graph: SceneGraph, changes: Sequence[ObjectChange], stamp_ns: int) -> None:
+        """Floors, rooms, doors and things as they are now, and what has become of things since the map of before."""
         if self._graph.has_sinks() and self._labels is not None:
-            self._graph.log(_draw_graph(graph, self._labels, stamp_ns), log_time=stamp_ns)
+            self._graph.log(_draw_graph(graph, changes, self._labels, stamp_ns), log_time=stamp_ns)
 
     def _camera(self, camera_id: str) -> _Camera:
         if camera_id not in self._cameras:
@@ -272,7 +273,9 @@ def _stamp(stamp_ns: int) -> messages.Timestamp:
     return messages.Timestamp(stamp_ns // 10**9, stamp_ns % 10**9)
 
 
-def _draw_graph(graph: SceneGraph, label_set: LabelSet, stamp_ns: int) -> messages.SceneUpdate:
+def _draw_graph(
+    graph: SceneGraph, changes: Sequence[ObjectChange], label_set: LabelSet, stamp_ns: int
+) -> messages.SceneUpdate:
     """Boxes of things, outlines of rooms and doors, each with its name, in place of all that was drawn before."""
     entities = [_thing(thing, label_set, stamp_ns) for thing in graph.things]
     for room in graph.rooms:
@@ -283,6 +286,14 @@ def _draw_graph(graph: SceneGraph, label_set: LabelSet, stamp_ns: int) -> messag
         top = _text(f"door {door.rooms[0]}-{door.rooms[1]}, {door.width_m:.2f} m", door.center, DOOR_COLOR)
         post = _line([door.center, door.center + 2.0 * graph.up], DOOR_COLOR, closed=False)
         entities.append(_entity(f"door/{number}", stamp_ns, lines=[post], texts=[top]))
+    for change in changes:
+        r, g, b = (value / 255 for value in CHANGE_COLORS[change.kind])
+        thing, color = change.object, messages.Color(r=r, g=g, b=b, a=1.0)
+        name = _text(f"{thing.class_name} {thing.id}: {change.kind}", thing.box.center, color)
+        lines = list[object]()
+        if change.kind == "moved" and change.before is not None:
+            lines.append(_line([change.before.box.center, thing.box.center], color, closed=False))
+        entities.append(_entity(f"change/{thing.id}", stamp_ns, lines=lines, texts=[name]))
     gone = messages.SceneEntityDeletion(timestamp=_stamp(stamp_ns), type=messages.SceneEntityDeletionType.All)
     return messages.SceneUpdate(deletions=[gone], entities=entities)
 

@@ -149,6 +149,7 @@ def _describe(history: list[Status]) -> dict[str, Any]:
         "lost": sum(losses) if losses else None,
         **({"cpu_percent": round(gained["cpu_ms"] / seconds / 10, 1)} if seconds and "cpu_ms" in gained else {}),
         **({"step_ms": round(gained["step_us"] / gained["fused"] / 1e3, 2)} if gained.get("fused") else {}),
+        **({"changes": "{moved}/{new}/{gone}".format_map(last.counters)} if "moved" in last.counters else {}),
         "rates_hz": {name: round(rate, 2) for name, rate in rates.items()},
         "ages_s": {name: round(age, 3) for name, age in last.ages_s.items()},
         "counters": dict(last.counters),
@@ -186,5 +187,6 @@ _COLUMNS = {  # by heading: how it is written, and what
     "msgs/s": ("{:.1f}", "rates_hz.messages"),
     "log MB": ("{:.1f}", "log_mb"),
     "lost": ("{}", "lost"),
+    "moved/new/gone": ("{}", "changes"),
     "beat s": ("{:.1f}", "ages_s.beat"),
 }

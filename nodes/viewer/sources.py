@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,10 +17,12 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.map_feed import MapFollower, thinned
+from semantic_mapper.nodes.map_feed import MapFollower, follow_changes, thinned
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import MapPoses, Streams
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph, find_graph
+from semantic_mapper.queries.objects import ObjectChange, ObjectMemory
+from semantic_mapper.queries.questions import RememberedObjects
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.rerun_log import RerunLog
@@ -61,8 +63,8 @@ class Live:
 class MapShow:
     """Shows one state of a map after the other."""
 
-    def __init__(self, log: RerunLog) -> None:
-        self._log = log
+    def __init__(self, log: RerunLog, changes: Callable[[], Sequence[ObjectChange]] = tuple) -> None:
+        self._log, self._changes = log, changes
         self._shown: NDArray[np.int64] | None = None  # contents of the blocks
         self._graph: GraphTracker | None = None
         self._graph_at = 0.0
@@ -82,7 +84,7 @@ class MapShow:
             return
         self._graph = self._graph or GraphTracker()
         try:
-            self._log.log_graph(self._graph.update(snapshot), self._graph.gone)
+            self._log.log_graph(self._graph.update(snapshot), self._graph.gone, self._changes())
         except MapError as error:
             _log.debug("graph_not_shown", reason=str(error))
         self._graph_at = time.monotonic() + GRAPH_S
@@ -124,7 +126,10 @@ def show_saved(path: Path, begin: Begin) -> None:
     voxel_map = VoxelMap.load(path)
     log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
     log.note_scale(voxel_map.scale_known)
-    log.finish(voxel_map.points(), find_graph(voxel_map))
+    if (graph := find_graph(voxel_map)) is not None:
+        memory = RememberedObjects.of_saved(ObjectMemory.from_bytes(voxel_map.objects).objects)
+        log.log_graph(graph, changes=memory.changes)
+    log.finish(voxel_map.points())
 
 
 def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]) -> None:
@@ -140,7 +145,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
             return
         log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
         log.note_scale(snapshot.scale_known)
-        show, began = MapShow(log), time.monotonic()
+        show, began = MapShow(log, follow_changes(client)), time.monotonic()
         newest_ns = [0]  # stamp of the newest frame; cameras and logs may have clocks of their own
 
         def look() -> None:
