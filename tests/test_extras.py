@@ -38,6 +38,10 @@ VERB = "from semantic_mapper.nodes.cli.main import app; app({!r})"
             TRY.format("from semantic_mapper.nodes.agents import serve as s; s(print)"),
             "pip install 'semantic-mapper[mcp]'",
         ),
+        (
+            TRY.format("from semantic_mapper.replay.exporters.lerobot import LeRobotExporter as e; e(None, None)"),
+            "pip install 'semantic-mapper[lerobot]'",
+        ),
         (VERB.format(["fleet", "table", "none"]), "pip install 'semantic-mapper[fleet]'"),
     ],
 )

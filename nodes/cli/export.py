@@ -52,7 +52,7 @@ def export(
     Maps: .ply points (--format ply-mesh: a mesh), .glb mesh, .rrd for Rerun, .yaml or .pgm floor plan for
     nav2 (free only where the floor was seen; --costs: 0 to 100, mode raw, unknown 255). A running mapper gives less
     than its saved map: the likeliest class of a voxel; weight 1, or below for computed depth. Logs: .mcap for Foxglove,
-    .txt trajectory (TUM), folder that `import` reads again without loss, --format tum.
+    .txt trajectory (TUM), folder that `import` reads again without loss, --format tum or lerobot.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
     Example: semantic-mapper export runs/kitchen --out plan.yaml --height 0.1 1.2

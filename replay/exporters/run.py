@@ -12,17 +12,18 @@ from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, choose_format, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.exporters.foxglove import FoxgloveExporter
+from semantic_mapper.replay.exporters.lerobot import LeRobotExporter
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_as
 from semantic_mapper.transport.images import sniff_image
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
-LogFormat = Literal["foxglove", "trajectory", "tum", "folder"]
+LogFormat = Literal["foxglove", "trajectory", "tum", "folder", "lerobot"]
 FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
 _SUFFIXES: dict[str, LogFormat] = {".mcap": "foxglove", ".txt": "trajectory", ".tum": "trajectory", "": "folder"}
-_FOLDERS = ("tum", "folder")
-_ONE_CAMERA = ("trajectory", "tum", "folder")
+_FOLDERS = ("tum", "folder", "lerobot")
+_ONE_CAMERA = ("trajectory", *_FOLDERS)
 
 
 class LogExportReport(NamedTuple):
@@ -48,7 +49,7 @@ def export_log(
     on_frame: Callable[[], None] = lambda: None,
 ) -> LogExportReport:
     """Write the frames of a log, at most ``max_frames`` (0 = all), to a file or folder that is there only once it is
-    whole; those of one ``camera``, without which a trajectory, tum or folder refuses a log of several. Damaged frames
+    whole; those of one ``camera``, without which all but Foxglove refuse a log of several. Damaged frames
     are passed over and stand in the ``errors`` of the log. ``on_frame`` is called for each frame that was looked at.
 
     Raises ConfigError: a camera that is not in the log, or several where the format holds one. MapError: the format
@@ -91,6 +92,8 @@ def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
         return FoxgloveExporter(place, info)
     if name == "trajectory":
         return TrajectoryExporter(place, info.scale_known)
+    if name == "lerobot":
+        return LeRobotExporter(place, info)
     return TumExporter(place) if name == "tum" else FolderExporter(place, info)
 
 

@@ -3,12 +3,14 @@
 import dataclasses
 import json
 from base64 import b64decode
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import cv2
 import mcap.reader
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -198,3 +200,42 @@ def test_what_cannot_be_written_is_refused_and_what_is_damaged_left_out(log: Pat
     damaged[len(damaged) // 2] ^= 0xFF
     log.write_bytes(damaged)
     assert exported(log, tmp_path / "sequence").frames == 6
+
+
+def test_a_lerobot_dataset_holds_pictures_poses_and_labels_of_each_frame(tmp_path: Path) -> None:
+    frames = [turned(seq, world=int(seq > 4), label=None if seq == 3 else turned(seq).label) for seq in range(70)]
+    report = exported(write_log(tmp_path / "log.mcap", frames, PACKING[:2]), tmp_path / "set", "lerobot")
+    assert report.frames == 70 and "1 of 70 frames have no labels" in report.notices[0] and "depth" in report.notices[1]
+    table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet").to_pylist()
+    info, stats = (json.loads((tmp_path / f"set/meta/{name}.json").read_text()) for name in ("info", "stats"))
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 30 and table[0].keys() == info["features"].keys()
+    camera = f"observation.images.{frames[0].camera_id}"
+    for row, frame in zip(table, frames, strict=True):
+        x, y, z, *turn = row["observation.state"]
+        np.testing.assert_allclose((x, y, z), frame.T_world_camera[:3, 3], rtol=1e-6)
+        np.testing.assert_allclose(Rotation.from_quat(turn).as_matrix(), frame.T_world_camera[:3, :3], atol=1e-6)
+        assert (row["stamp_ns"], row["episode_index"], row["index"]) == (frame.stamp_ns, frame.world, frame.seq)
+        assert row["timestamp"] == pytest.approx(row["frame_index"] / 30)
+        label = cv2.imdecode(np.frombuffer(row["labels"]["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
+        expected = np.full(label.shape, LABELS.ignore_id) if frame.label is None else frame.label
+        np.testing.assert_array_equal(label, expected)
+        picture = cv2.imdecode(np.frombuffer(row[camera]["bytes"], np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_array_equal(picture[..., ::-1], frame.rgb)
+    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [(e["dataset_from_index"], e["dataset_to_index"], e["length"]) for e in episodes] == [(0, 5, 5), (5, 70, 65)]
+    rgb = np.stack([frame.rgb for frame in frames]) / 255
+    np.testing.assert_allclose(np.ravel(stats[camera]["mean"]), rgb.mean(axis=(0, 1, 2)), atol=0.01)
+    np.testing.assert_allclose(np.ravel(stats[camera]["std"]), rgb.std(axis=(0, 1, 2)), atol=0.01)
+
+
+@pytest.mark.skipif(find_spec("lerobot") is None, reason="lerobot is not installed")
+def test_the_own_loader_of_lerobot_reads_it(tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore
+
+    frames = [turned(seq, world=int(seq > 4)) for seq in range(9)]
+    exported(write_log(tmp_path / "log.mcap", frames, PACKING[:1]), tmp_path / "set", "lerobot")
+    read = LeRobotDataset("here/set", root=tmp_path / "set")
+    assert (len(read), read.num_episodes, read.fps, read[7]["task"]) == (9, 2, 30, "explore")
+    np.testing.assert_array_equal((read[7]["labels"][0] * 255).round().numpy(), frames[7].label)
+    picture = (read[7][f"observation.images.{frames[7].camera_id}"] * 255).round().numpy()
+    np.testing.assert_array_equal(picture.transpose(1, 2, 0), frames[7].rgb)
