@@ -1,6 +1,7 @@
 """Are the first answers to generated phrases right? Homes of ``scenes.days``, one visit, true labels.
 
     python -m research.experiments.find --split test
+    python -m research.experiments.find --split test --mcp    # 20 things in 3 homes, by the MCP SDK's own client
 
 A phrase has a class or a synonym and one to three of: colour, size, room, a relation; at most half of the things of its
 class fit it. What is said of a thing is true, false, or unclear by the scene itself: colours by hue and value of the
@@ -12,12 +13,16 @@ from __future__ import annotations
 import argparse
 import colorsys
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import anyio
 import numpy as np
+from mcp import Client, StdioServerParameters, stdio_client
 
 from research.experiments.days import FRAME_NS, FRAMES, LEAST_FRAMES, LEAST_PIXELS, SPLITS, VISIT_NS, WIDTH, near
 from research.experiments.put_things import map_frame
@@ -29,6 +34,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.find import FoundObject, find, open_objects
+from semantic_mapper.queries.instances import OrientedBox
 from semantic_mapper.queries.objects import remember
 from semantic_mapper.types import Float64
 
@@ -178,6 +184,26 @@ def rank(answers: Sequence[FoundObject], things: Sequence[Thing], truth: Sequenc
     return 0
 
 
+def ask_agent(path: Path, texts: Sequence[str]) -> list[list[Any]]:
+    """What ``semantic-mapper mcp`` answers to phrases, as ``find`` would."""
+    program = Path(sys.executable).with_name("semantic-mapper")
+
+    async def ask() -> list[list[Any]]:
+        server, found = StdioServerParameters(command=str(program), args=["mcp", str(path)]), list[list[Any]]()
+        async with Client(stdio_client(server)) as client:
+            for text in texts:
+                content: Any = (await client.call_tool("find", {"phrase": text})).content[0]
+                found.append([_object(**answer) for answer in json.loads(content.text)["answers"]])
+        return found
+
+    return anyio.run(ask)
+
+
+def _object(box: dict[str, Any], **said: Any) -> Any:
+    places = OrientedBox(*(np.array(box[name]) for name in ("center", "size", "R_world_box")))
+    return SimpleNamespace(object=SimpleNamespace(class_name=said["class"], box=places))
+
+
 def main() -> None:
     """Map what is missing, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -186,15 +212,22 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("runs/find"), help="maps of homes; made where they are missing"
     )
+    parser.add_argument("--mcp", action="store_true", help="ask for 20 things in 3 homes, as an agent does")
     parser.add_argument("--say", action="store_true", help="name each phrase whose first answer is wrong")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    ranks, alone, seeds = list[int](), list[int](), SPLITS[arguments.split]
+    ranks, alone, seeds = list[int](), list[int](), SPLITS[arguments.split][: 3 if arguments.mcp else None]
     for seed in seeds:
         path = arguments.out / f"{seed}.npz"
         if not path.exists():
             make(seed, arguments.out)
         things = [Thing(*row) for row in json.loads(path.with_suffix(".json").read_text())]
+        if arguments.mcp:
+            asked = list(phrases(things, 7 if seed < seeds[2] else 6, np.random.default_rng((49, seed))))
+            answers = ask_agent(path, [text for text, _, _ in asked])
+            ranks += [rank(found, things, truth) for found, (_, _, truth) in zip(answers, asked, strict=True)]
+            print(seed, list(zip([text for text, _, _ in asked], ranks[-len(asked) :], strict=True)), flush=True)
+            continue
         snapshot, objects = open_objects(path)
         for text, noun, truth in phrases(
             things, -(-arguments.phrases // len(seeds)), np.random.default_rng((79, seed))
@@ -205,7 +238,7 @@ def main() -> None:
             if arguments.say and ranks[-1] != 1:
                 got = [f"{a.object.class_name} {a.object.box.center.round(1)} {dict(a.parts)}" for a in answers[:1]]
                 print(f"{seed} {ranks[-1]} {text}: got {got}", flush=True)
-    for what, found in (("phrase", ranks), ("noun alone", alone)):
+    for what, found in (("phrase", ranks), *([("noun alone", alone)] if alone else [])):
         first, five = (sum(0 < r <= most for r in found) / len(found) for most in (1, 5))
         print(f"{len(found)} x {what}: first answer right {first:.0%}, one of the first five {five:.0%}")
 
