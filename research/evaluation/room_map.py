@@ -117,7 +117,7 @@ def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -
     pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
-    furnished = RoomConfig(camouflage=suite.sequence.camouflage)
+    furnished = RoomConfig(style=suite.sequence.style, camouflage=suite.sequence.camouflage)
     scene = make_room(seed, furnished)
     views: list[RoomLook] = []
     poses: list[Float64] = []

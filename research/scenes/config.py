@@ -13,12 +13,14 @@ VALIDATION_SEEDS = range(100_000, 100_020)
 TEST_SEEDS = range(200_000, 200_020)
 
 Programme = Literal["bedroom", "living", "office", "kitchen", "bathroom", "studio"]
+Style = Literal["rooms", "turned"]
 DepthSensorName = Literal["oak_d", "d435", "exact", "none"]
 
 
 class RoomConfig(Config, frozen=True):
     """What a room may look like; the seed decides within these bounds."""
 
+    style: Style = "rooms"  # "turned": rooms of ``scenes.turned``, which nothing is trained on
     template: Programme | None = None  # None: the seed decides
     min_side_m: float = 3.0
     max_side_m: float = 6.0

@@ -7,7 +7,7 @@ import numpy as np
 from research.scenes.furniture import FURNITURE
 from research.scenes.materials import Palette
 from research.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z, scaled
-from research.scenes.shell import build_shell, wall_pose
+from research.scenes.shell import Shell, build_shell, wall_pose
 from semantic_mapper.types import Float64
 
 _GAP_M = 0.015  # between two pieces, and between a piece and the wall behind it
@@ -25,6 +25,7 @@ class Layout:
         palette: The room's materials.
         wet: A bathroom, with tiles.
         variety: Draws what only varied rooms have; None: not one of them.
+        shell: Of the room; None: one is drawn.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Layout:
         *,
         wet: bool = False,
         variety: np.random.Generator | None = None,
+        shell: Shell | None = None,
     ) -> None:
         self.size_m = size_m
         self.rng = rng
@@ -46,7 +48,7 @@ class Layout:
         self._tops: list[tuple[Top, float, Float64]] = []  # with yaw and position of the piece they belong to
         self._low, self._high = np.zeros((0, 3)), np.zeros((0, 3))  # of all parts that stand
         self._free_low, self._free_high = np.zeros((0, 3)), np.zeros((0, 3))  # zones to keep free
-        shell = build_shell(size_m, rng, palette, wet=wet, variety=variety)
+        shell = shell or build_shell(size_m, rng, palette, wet=wet, variety=variety)
         self.groups.extend(shell.groups)
         self.far_lamp = shell.lamp
         self.has_opening = shell.free is not None

@@ -14,6 +14,7 @@ from research.scenes.scene import Scene, kernel_arrays
 from research.scenes.sensor_color import develop, expose
 from research.scenes.sensor_depth import measure_depth
 from research.scenes.shots import Shot, single_shot
+from research.scenes.veneer import veneered
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
@@ -99,9 +100,16 @@ def light_seen(
     primitives, materials, lights = kernel_arrays(scene)
     camera = (T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy(), i.fx, i.fy, i.cx, i.cy)
     lit = shade_pixels(depth, index, primitives, materials, lights, *camera)
-    if scene.daylight is None:
+    if scene.daylight is None and scene.veneer is None:
         return lit
     normal = surface_normals(depth, index, primitives, *camera)
+    if scene.veneer is not None:
+        hit = index >= 0
+        points = camera[0] + camera_rays(i, T_world_camera)[hit] * depth[hit, None]
+        material = scene.primitives.material[index[hit]]
+        lit[hit] = veneered(scene.veneer, lit[hit], normal[hit], points, material)
+    if scene.daylight is None:
+        return lit
     return lit_by_day(scene.daylight, lit, normal, depth, camera_rays(i, T_world_camera), camera[0])
 
 

@@ -11,6 +11,7 @@ from research.scenes.people import add_beings
 from research.scenes.primitives import Primitives, pack
 from research.scenes.room_templates import CYCLE, ROOM_TEMPLATES, furnish
 from research.scenes.scene import Lights, Scene, extremes, shadow_cubes
+from research.scenes.turned import make_turned_room
 from semantic_mapper.errors import ConfigError
 
 _GLARE = 0.35  # fraction of the rooms with one hard, strong light
@@ -25,6 +26,8 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     Raises ConfigError: negative seed, or bounds of ``config`` that leave nothing to choose.
     """
     _check(seed, config)
+    if config.style == "turned":
+        return make_turned_room(seed, config)
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
     template = config.template or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, template, config)

@@ -13,6 +13,7 @@ from research.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArr
 from research.scenes.materials import MaterialTable, joined_tables
 from research.scenes.people import Walk
 from research.scenes.primitives import Primitives
+from research.scenes.veneer import Veneer
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.types import Float32, Float64
 
@@ -66,6 +67,7 @@ class Scene:
         walks: What moves from frame to frame.
         label_set: Of the label images.
         daylight: Sun and sky; None indoors. ``lights`` are then ``NO_LAMPS``.
+        veneer: What the materials, which are white then, reflect; None: their own patterns.
     """
 
     seed: int
@@ -77,6 +79,7 @@ class Scene:
     walks: tuple[Walk, ...] = ()
     label_set: LabelSet = ROOMS
     daylight: Daylight | None = None
+    veneer: Veneer | None = None
 
 
 def scene_at(scene: Scene, frame: int) -> Scene:

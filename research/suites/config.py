@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from research.scenes import SUITE_VERSION, CameraPathConfig, RoomConfig
-from research.scenes.config import DepthSensorName
+from research.scenes.config import DepthSensorName, Style
 from research.scenes.suite import ROOMS_SUITE
 from semantic_mapper.config import (
     AtLeastOne,
@@ -79,6 +79,7 @@ class SequenceConfig(Config, frozen=True):
     step_m: Positive = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
     query_pairs: AtLeastOne = 2  # spread evenly over the sequence
     pair_gap: AtLeastOne = 4  # the second view of a pair is this many frames on
+    style: Style = "rooms"  # "turned": of a generator that nothing is trained on
     camouflage: Fraction = RoomConfig().camouflage  # chance that a pair of classes shares one material
     camera: CameraConfig = CameraConfig()
 
@@ -207,9 +208,13 @@ def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
         plain = {key: plain[key] for key in ("depth", "map_frames", "mapper")} | {"step_m": suite.sequence.step_m}
         if suite.sequence.camouflage != RoomConfig().camouflage:  # left out otherwise: older records stay valid
             plain["camouflage"] = suite.sequence.camouflage
+        if suite.sequence.style != RoomConfig().style:
+            plain["style"] = suite.sequence.style
         plain["instances"] = "ranked by confidence and size"
     else:
         del plain["map_frames"], plain["mapper"]
+        if suite.sequence.style == RoomConfig().style:
+            del plain["sequence"]["style"]
         if suite.protocol == "generalize":
             del plain["scene"]
             plain["spacing"] = repr(SPACINGS.get(suite.sources))

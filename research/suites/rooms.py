@@ -89,7 +89,7 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
         roll_deg=asked.roll_deg,
     )
     noise = NoiseConfig(depth=asked.sensor)
-    furnished = RoomConfig(camouflage=suite.sequence.camouflage)
+    furnished = RoomConfig(style=suite.sequence.style, camouflage=suite.sequence.camouflage)
     frames = tuple(room_frames(seed, suite.sequence.frames, camera, room=furnished, path=path, noise=noise))
     scene = make_room(seed, furnished)
     pairs = query_pairs(suite)
