@@ -8,6 +8,7 @@ textures (``veneer``), and light comes from a wall of windows. Cameras and senso
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,9 +40,7 @@ class Stock:
         self.rng = rng
         self._veneers: list[tuple[Grain, Float64, float, Float64]] = []
         self._emission: list[float] = []
-        self._pools = {
-            name: [self._add(*kind) for _ in range(count)] for name, (count, *kind) in _POOLS.items()
-        }
+        self._pools = {name: [self._add(*kind) for _ in range(count)] for name, (count, *kind) in _POOLS.items()}
         self._pools["pane"] = [self._add((Grain.CLOUD, Grain.BANDS), (0.5, 1.5), (0.0, 0.4), rng.uniform(0.3, 2.5))]
 
     def _add(
@@ -85,11 +84,9 @@ class Stock:
 Builder = Callable[[Assembly, np.random.Generator, Stock], None]
 
 
-def _lathe(
-    a: Assembly, m: int, x: float, y: float, profile: Sequence[tuple[float, float]], **options: object
-) -> None:
+def _lathe(a: Assembly, m: int, x: float, y: float, profile: Sequence[tuple[float, float]], **options: object) -> None:
     """A body of revolution through (height, radius), as discs of at most 3 cm."""
-    for (z0, r0), (z1, r1) in zip(profile[:-1], profile[1:], strict=True):
+    for (z0, r0), (z1, r1) in pairwise(profile):
         n = 1 if r0 == r1 else int(np.ceil((z1 - z0) / 0.03))
         for k in range(n):
             r, high = r0 + (r1 - r0) * (k + 0.5) / n, (z1 - z0) / n
@@ -200,7 +197,9 @@ def _sofa(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
             a.cylinder(m, (x, y, 0.37), (0.26, 0.26, 0.74 + 0.1 * np.sin(angle)))
     for k in range(int(rng.integers(0, 3))):
         x = rng.uniform(-0.3, 0.3) * w
-        a.ellipsoid(s.pick("cloth", "thing"), (x, d * 0.45, high + 0.16), (0.4, 0.2, 0.36), label="otherprop", item=k + 1)
+        a.ellipsoid(
+            s.pick("cloth", "thing"), (x, d * 0.45, high + 0.16), (0.4, 0.2, 0.36), label="otherprop", item=k + 1
+        )
 
 
 def _bed(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
@@ -224,7 +223,9 @@ def _bed(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     for k in range(1 if w < 1.3 else 2):
         x = 0.0 if w < 1.3 else (k - 0.5) * w * 0.5
         size = (0.2, 0.2, rng.uniform(0.45, 0.65))
-        a.cylinder(s.pick("cloth"), (x, 0.42, low + 0.28), size, yaw=np.pi / 2, tilt=np.pi / 2, label="otherprop", item=k + 1)
+        a.cylinder(
+            s.pick("cloth"), (x, 0.42, low + 0.28), size, yaw=np.pi / 2, tilt=np.pi / 2, label="otherprop", item=k + 1
+        )
 
 
 def _cabinet(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
@@ -264,7 +265,14 @@ def _bookshelf(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
             thick, tall, item = rng.uniform(0.04, 0.12), rng.uniform(0.14, 0.25), item + 1
             if rng.uniform() < 0.75:
                 center = (x, d / 2, float(z) + 0.015 + tall / 2)
-                a.box(s.pick("thing"), center, (thick, 0.2, tall), label="otherprop", item=item, yaw=rng.uniform(-0.2, 0.2))
+                a.box(
+                    s.pick("thing"),
+                    center,
+                    (thick, 0.2, tall),
+                    label="otherprop",
+                    item=item,
+                    yaw=rng.uniform(-0.2, 0.2),
+                )
             x += thick * 1.15
     a.cylinder(m, (0, d / 2, h), (w, d, 0.03))
 
@@ -290,7 +298,12 @@ def _counter(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
 
 def _refrigerator(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     """Round-shouldered, of one door or two, with a bar of a handle."""
-    m, w, d, h = s.pick("plain", "thing", "stone"), rng.uniform(0.55, 0.75), rng.uniform(0.55, 0.68), rng.uniform(1.4, 1.9)
+    m, w, d, h = (
+        s.pick("plain", "thing", "stone"),
+        rng.uniform(0.55, 0.75),
+        rng.uniform(0.55, 0.68),
+        rng.uniform(1.4, 1.9),
+    )
     split = h * rng.uniform(0.6, 0.72)
     a.pillow(m, (0, d / 2, split / 2 + 0.02), (w, d, split))
     a.pillow(m, (0, d / 2, (h + split) / 2), (w, d, h - split))
@@ -318,7 +331,12 @@ def _sink(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
 
 def _bathtub(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     """An oval that stands free on balls."""
-    m, w, d, high = s.pick("plain", "stone", "thing"), rng.uniform(1.4, 1.8), rng.uniform(0.7, 0.85), rng.uniform(0.5, 0.62)
+    m, w, d, high = (
+        s.pick("plain", "stone", "thing"),
+        rng.uniform(1.4, 1.8),
+        rng.uniform(0.7, 0.85),
+        rng.uniform(0.5, 0.62),
+    )
     for k in range(8):
         f = 0.72 + 0.28 * (k / 7) ** 0.6
         a.cylinder(m, (0, d / 2, 0.1 + (k + 0.5) * (high - 0.1) / 8), (w * f * 0.95, d * f * 0.95, (high - 0.1) / 8))
@@ -469,7 +487,9 @@ def _shell(size: tuple[float, float, float], rng: np.random.Generator, s: Stock)
     paint, groups, solid = s.pick("wall", "plain"), [floor.parts, ceiling.parts], list[Part]()
     for k in range(4):
         wall, long = Assembly("wall"), size[k % 2]
-        wall.box(s.pick("wall", "stone") if rng.uniform() < 0.3 else paint, (long / 2, -0.05, h / 2), (long + 0.2, 0.1, h))
+        wall.box(
+            s.pick("wall", "stone") if rng.uniform() < 0.3 else paint, (long / 2, -0.05, h / 2), (long + 0.2, 0.1, h)
+        )
         groups.append(place_parts(wall, *wall_pose(size, k, 0.0)))
     kind, k = int(rng.integers(3)), int(rng.integers(4))
     long, more = size[k % 2], Assembly("ceiling" if kind == 0 else "wall")
