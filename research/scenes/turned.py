@@ -194,7 +194,8 @@ def _sofa(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
         a.cylinder(m, (0, d / 2 + 0.05, high / 2 + 0.04), (w * 0.85, d * 0.9, high - 0.06))
         for angle in np.linspace(-0.35, np.pi + 0.35, 9 + 2 * seats):
             x, y = w * 0.43 * np.cos(angle), d / 2 - (d / 2 - 0.13) * np.sin(angle)
-            a.cylinder(m, (x, y, 0.37), (0.26, 0.26, 0.74 + 0.1 * np.sin(angle)))
+            tall = 0.78 + 0.1 * float(np.sin(angle))
+            a.cylinder(m, (x, y, tall / 2), (0.26, 0.26, tall))
     for k in range(int(rng.integers(0, 3))):
         x = rng.uniform(-0.3, 0.3) * w
         a.ellipsoid(
@@ -214,7 +215,7 @@ def _bed(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     a.pillow(cover, (0, d * 0.62, low + 0.14), (w * 1.04, d * 0.74, 0.2))
     kind = int(rng.integers(3))
     if kind == 0:
-        a.cylinder(m, (0, 0.03, low + 0.1), (w, 1.3, 0.06), tilt=np.pi / 2)
+        a.cylinder(m, (0, 0.03, low + 0.5), (w, 0.9, 0.06), tilt=np.pi / 2)
     elif kind == 1:
         for x in (-0.25, 0.25):
             _hoop(a, m, (x * w, 0.04, low + 0.35), w * 0.52, 0.8, 0.07)
@@ -343,7 +344,7 @@ def _bathtub(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     a.torus(m, (0, d / 2, high), (w, d, 0.14))
     for x in (-0.3, 0.3):
         for y in (0.3, 0.7):
-            a.ellipsoid(s.pick("thing"), (x * w, y * d, 0.06), (0.12, 0.12, 0.14))
+            a.ellipsoid(s.pick("thing"), (x * w, y * d, 0.07), (0.12, 0.12, 0.14))
 
 
 def _round_door(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
@@ -363,8 +364,8 @@ def _window(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     if rng.uniform() < 0.35:
         w = rng.uniform(0.8, 1.2)
         a.cylinder(pane, (0, 0.01, z), (w, w, 0.02), tilt=np.pi / 2, casts_shadow=False)
-        _hoop(a, frame, (0, 0.02, z), w * 1.25, w * 1.25, 0.1)
-        a.box(frame, (0, 0.02, z), (0.04, 0.05, w))
+        _hoop(a, frame, (0, 0.051, z), w * 1.25, w * 1.25, 0.1)
+        a.box(frame, (0, 0.026, z), (0.04, 0.05, w))
     else:
         n = int(rng.integers(2, 5))
         w, one, h = n * 0.42, 0.34, rng.uniform(0.9, 1.3)
@@ -386,7 +387,7 @@ def _picture(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     w, z = rng.uniform(0.3, 0.7), rng.uniform(1.4, 1.7)
     h = w * rng.uniform(0.8, 1.5)
     a.cylinder(s.pick("thing", "cloth"), (0, 0.012, z), (w, h, 0.02), tilt=np.pi / 2)
-    _hoop(a, s.pick("wood", "thing"), (0, 0.012, z), w * 1.2, h * 1.2, 0.06)
+    _hoop(a, s.pick("wood", "thing"), (0, 0.031, z), w * 1.2, h * 1.2, 0.06)
 
 
 def _furniture(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
