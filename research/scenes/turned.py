@@ -40,7 +40,10 @@ class Stock:
         self.rng = rng
         self._veneers: list[tuple[Grain, Float64, float, Float64]] = []
         self._emission: list[float] = []
-        self._pools = {name: [self._add(*kind) for _ in range(count)] for name, (count, *kind) in _POOLS.items()}
+        self._pools = {
+            name: [self._add(grains, scale, colour) for _ in range(count)]
+            for name, (count, grains, scale, colour) in _POOLS.items()
+        }
         self._pools["pane"] = [self._add((Grain.CLOUD, Grain.BANDS), (0.5, 1.5), (0.0, 0.4), rng.uniform(0.3, 2.5))]
 
     def _add(
