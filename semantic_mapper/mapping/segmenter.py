@@ -272,7 +272,7 @@ def _with_one_output(network: ov.Model, name: str) -> ov.Model:
         raise ValueError(
             f'say `output_name = "{names[0]}"` in the table, or another of its outputs: {", ".join(names)}'
         )
-    return ov.Model([network.get_results()[names.index(name) if name else 0]], network.get_parameters())
+    return ov.Model([network.get_results()[names.index(name) if name else 0]], network.get_parameters())  # pyright: ignore[reportGeneralTypeIssues]
 
 
 def _likelihoods(answers: list[int], count: int, miss: float, false_alarm: float) -> Float32:
