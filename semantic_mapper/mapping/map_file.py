@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
 
@@ -37,6 +38,7 @@ FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 4
 MAX_OBJECT_BYTES = 64 << 20
 CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
+_CHUNKS_AT_ONCE = 256  # that a mirror takes over: it sorts the keys of all blocks each time
 ADVICE = "Use another copy, or make the map again from its log with `semantic-mapper map`"
 
 Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
@@ -226,27 +228,17 @@ class MapReader:
             yield keys, values
             del values  # while the next ones are read
 
-    def changes(self) -> BlockChanges:
-        """What ``VoxelMap.changes(0)`` of the loaded map gives, in memory for the result and one chunk."""
-        saved, config = self.manifest, self.manifest.config
+    def changes(self) -> Iterator[BlockChanges]:
+        """What ``VoxelMap.changes(0)`` of the loaded map gives, in parts, in memory for one; each completes the map's
+        version."""
+        saved, config, parts = self.manifest, self.manifest.config, self.parts()
         decision = Decision(config.vote_discount, config.unknown_below, SURFACE_WEIGHT)
-        try:
-            keys = np.empty((saved.blocks, 3), np.int32)
-            versions = 0, saved.frames, saved.frames, 0
+        for start in range(0, max(len(saved.chunks), 1), _CHUNKS_AT_ONCE):
+            chunks = saved.chunks[start : start + _CHUNKS_AT_ONCE]
+            keys, versions = np.empty((sum(c.blocks for c in chunks), 3), np.int32), (0, saved.frames, saved.frames, 0)
             result = empty_changes(*versions, keys, scale_known=saved.scale_known, cleared=NONE_CLEARED)
-            return CopiedChanges(result, self._packed_into(keys), saved.label_set, decision).compact()
-        except MemoryError as error:
-            raise MapError(f"{self._path}: no memory for its {saved.blocks:,} blocks: {error}") from error
-
-    def _packed_into(self, keys: Int32) -> Iterator[tuple[Int64, PackedBlocks]]:
-        """The blocks of ``parts``, packed, and their rows in ``keys``, which are filled."""
-        row = 0
-        for part, values in self.parts():
-            rows = np.arange(row, row + len(part))
-            keys[rows] = part
-            yield rows, pack_blocks(values, np.arange(len(part), dtype=np.int32))
-            row += len(part)
-            del values  # while the next ones are read
+            packed = _packed_into(keys, islice(parts, len(chunks)))
+            yield CopiedChanges(result, packed, saved.label_set, decision).compact()
 
     def places(self) -> tuple[Place, ...]:
         """What the map is found again by, nothing where it does not say; ``MapError`` where it is damaged."""
@@ -312,6 +304,17 @@ class MapReader:
         if hashed.hexdigest() != sha256:
             raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {ADVICE}")
         return arrays
+
+
+def _packed_into(keys: Int32, parts: Iterable[BlockPart]) -> Iterator[tuple[Int64, PackedBlocks]]:
+    """Blocks, packed, and their rows in ``keys``, which are filled."""
+    row = 0
+    for part, values in parts:
+        rows = np.arange(row, row + len(part))
+        keys[rows] = part
+        yield rows, pack_blocks(values, np.arange(len(part), dtype=np.int32))
+        row += len(part)
+        del values  # while the next ones are read
 
 
 def _write_chunk(archive: zipfile.ZipFile, n: int, keys: Int32, values: BlockValues) -> MapChunk:

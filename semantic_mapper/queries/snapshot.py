@@ -22,6 +22,7 @@ from semantic_mapper.mapping.changes import (
     CONFIDENCE_STEPS,
     NONE_CLEARED,
     TSDF_STEPS,
+    UNOBSERVED,
     BlockChanges,
     ClearedBlocks,
     oldest_first,
@@ -144,9 +145,14 @@ class MapMirror:
     def load(cls, path: Path) -> MapMirror:
         """Mirror of a saved map, without its class evidence in memory; ``MapError`` as of ``VoxelMap.load``."""
         with open_map(path) as reader:
-            config = reader.manifest.config
-            mirror = cls(config.voxel_size_m, config.truncation_voxels, reader.manifest.label_set)
-            mirror.apply(reader.changes())
+            saved, config = reader.manifest, reader.manifest.config
+            mirror = cls(config.voxel_size_m, config.truncation_voxels, saved.label_set)
+            try:
+                mirror._next = replace(mirror._next, voxels=_new_pool(saved.blocks))
+            except MemoryError as error:
+                raise MapError(f"{path}: no memory for its {saved.blocks:,} blocks: {error}") from error
+            for changes in reader.changes():
+                mirror.apply(changes)
         return mirror
 
     @property
@@ -226,21 +232,20 @@ def _new_pool(blocks: int) -> BlockVoxels:
 
 
 def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int) -> None:
-    part = slice(start, start + len(changes.keys))
-    pool.tsdf[part] = changes.tsdf
-    computed = 0 if changes.computed is None else changes.computed
-    pool.weight[part] = np.where(changes.observed, np.where(computed, COMPUTED, MEASURED), 0)
-    pool.label[part] = changes.label
-    pool.confidence[part] = changes.confidence
-    pool.rgb[part] = changes.rgb
-    # Classes of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``).
+    # Part by part: what is computed of all voxels of a large map does not fit in memory. Classes are those of voxels
+    # that lie near enough to a surface to be one of its own (``surface_voxels``).
     for first in range(0, len(changes.keys), _LOOKED_AT_AT_ONCE):
-        rows = slice(first, first + _LOOKED_AT_AT_ONCE)
-        label, tsdf = changes.label[rows], changes.tsdf[rows]  # not observed is below -NEAREST_STEPS
+        rows = slice(first, min(first + _LOOKED_AT_AT_ONCE, len(changes.keys)))
+        to = slice(start + rows.start, start + rows.stop)
+        label, tsdf = changes.label[rows], changes.tsdf[rows]
+        computed = 0 if changes.computed is None else changes.computed[rows]
+        pool.tsdf[to], pool.label[to] = tsdf, label
+        pool.confidence[to], pool.rgb[to] = changes.confidence[rows], changes.rgb[rows]
+        pool.weight[to] = np.where(tsdf != UNOBSERVED, np.where(computed, COMPUTED, MEASURED), 0)
         at = np.flatnonzero((label != ignore_id) & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS))
         has_class = np.zeros((len(tsdf), 256), np.bool_)
         has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
-        pool.classes[part][rows] = np.packbits(has_class, axis=1, bitorder="little").view("<u8")
+        pool.classes[to] = np.packbits(has_class, axis=1, bitorder="little").view("<u8")
 
 
 def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:

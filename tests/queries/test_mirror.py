@@ -10,6 +10,7 @@ import pytest
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import LabelError, MapError
+from semantic_mapper.mapping import map_file
 from semantic_mapper.mapping.map_file import CHUNK_BLOCKS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries import snapshot as mirror_module
@@ -88,7 +89,8 @@ def test_damaged_changes_are_refused_and_leave_the_mirror_as_it_was() -> None:
     assert mirror.version == 0 and mirror.snapshot().block_count == 0
 
 
-def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path) -> None:
+def test_a_mirror_of_a_saved_map_is_that_of_the_loaded_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_file, "_CHUNKS_AT_ONCE", 1)
     voxel_map = VoxelMap(VoxelMapConfig(unknown_below=0.6), LABELS)
     for seq, pose in enumerate(poses(4)):
         integrate(voxel_map, pose, seq)
