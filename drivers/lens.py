@@ -74,10 +74,10 @@ def undistort(pixels: Float64, lens: CameraIntrinsics) -> Float64:
         return np.zeros((0, 2))
     K, coefficients, still = camera_matrix(lens), np.array(lens.distortion or (0.0,) * 4), np.zeros(3)
     # By default OpenCV ends after five rounds: pixels off at the corner of a usual lens.
-    invert, project = cv2.undistortPoints, cv2.projectPoints
+    invert, project = getattr(cv2, "undistortPointsIter", cv2.undistortPoints), cv2.projectPoints  # of OpenCV 4
     if isinstance(lens, FisheyeIntrinsics):
         invert, project = cv2.fisheye.undistortPoints, cv2.fisheye.projectPoints
-    slopes = np.asarray(invert(pixels[:, None], K, coefficients, criteria=_UNTIL), np.float64)
+    slopes = np.asarray(invert(pixels[:, None], K, coefficients, R=None, P=None, criteria=_UNTIL), np.float64)
     rays = np.concatenate((slopes, np.ones((len(slopes), 1, 1))), axis=2)
     back, _ = project(rays, still, still, K, coefficients)
     off = np.linalg.norm(np.asarray(back).reshape(-1, 2) - pixels, axis=1)

@@ -1,6 +1,6 @@
 """What maps have the same bits: one log mapped by other runtimes, processors' code, threads and another OpenCV.
 
-uv pip install onnx onnxruntime; uv pip install --target runs/cv4 --no-deps 'opencv-contrib-python-headless<5'
+uv pip install onnx onnxruntime setuptools ziglang; uv pip install --target runs/cv4 --no-deps 'opencv-contrib-python-headless<5'
 python -m research.bench.exact kitchen.mcap --opencv runs/cv4       # frames of 640x480 with depth and labels
 """
 
