@@ -1,6 +1,7 @@
 """What maps have the same bits: one log mapped by other runtimes, processors' code, threads and another OpenCV.
 
-uv pip install onnx onnxruntime setuptools ziglang; uv pip install --target runs/cv4 --no-deps 'opencv-contrib-python-headless<5'
+uv pip install onnx onnxruntime setuptools ziglang
+uv pip install --target runs/cv4 --no-deps 'opencv-contrib-python-headless<5'
 python -m research.bench.exact kitchen.mcap --opencv runs/cv4       # frames of 640x480 with depth and labels
 """
 
@@ -58,7 +59,7 @@ def map_log(variant: str, log: str, frames: int, folder: Path) -> float:
         run = runtimes.torch_run(model)
         if variant == "encoder by ONNX Runtime":
             seen = torch.zeros(1, COLOURS + numbers.SURFACE_CHANNELS, 2 * SIZE[0], 2 * SIZE[1])
-            example = (seen, seen[:, :1], seen[:, :1], torch.ones(1))
+            example = (seen, torch.ones(1, 1, *SIZE), torch.zeros(1, 1, *SIZE), torch.ones(1))
             path = folder / "encoder.onnx"
             names = {"input_names": list(runtimes.NAMES), "dynamo": False}
             torch.onnx.export(runtimes._Exported(model).eval(), example, path, **names)
