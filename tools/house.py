@@ -27,10 +27,10 @@ PACKAGE = "semantic_mapper"
 LINKED = ("drivers", "nodes", "replay")  # at the top level, and part of the package
 _PYTHON = [f"{folder}/**/*.py" for folder in SHIPPED]
 LIMITS = {
-    "shipped lines": 57_500,
+    "shipped lines": 58_000,
     "shipped modules": 300,
-    "lines of tests": 33_000,
-    "lines of research, tests included": 33_000,
+    "lines of tests": 33_300,
+    "lines of research, tests included": 34_000,
     "settings": 300,
     "commands": 24,
     "import circles": 0,
