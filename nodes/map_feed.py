@@ -68,17 +68,20 @@ class MapFollower:
 
 
 def follow_changes(client: MapClient) -> Callable[[], tuple[ObjectChange, ...]]:
-    """What gives the changes since the map that a mapper goes on in, as ``MapClient.objects`` does; of one that goes on
-    in none it asks but once."""
-    goes_on = True
+    """What gives the changes since the map that a mapper goes on in, as ``MapClient.objects`` does, or those before
+    where there is no answer; of one that goes on in none it asks but once."""
+    goes_on, known = True, ()
 
     def changes() -> tuple[ObjectChange, ...]:
-        nonlocal goes_on
-        if not goes_on:
-            return ()
-        memory = client.objects()
-        goes_on = memory.since_ns > 0
-        return memory.changes
+        nonlocal goes_on, known
+        if goes_on:
+            try:
+                memory = client.objects()
+            except SemanticMapperError as error:
+                _log.debug("changes_not_shown", reason=str(error))
+            else:
+                goes_on, known = memory.since_ns > 0, memory.changes
+        return known
 
     return changes
 

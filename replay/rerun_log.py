@@ -164,11 +164,10 @@ class RerunLog:
         legend = draw_map_legend(points.label, self._label_set, computed)
         self._stream.log("legend", rr.Image(legend))
 
-    def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = (), changes: Sequence[ObjectChange] = ()) -> None:
+    def log_graph(self, graph: SceneGraph, gone: Sequence[Instance] = ()) -> None:
         """Rooms, doors and things of the map as it is now, in the view that is coloured by class.
 
-        Where things were that are ``gone`` is drawn in grey, with the stamp of when they went; ``changes`` since the
-        map of before have their own colours, and what was moved an arrow.
+        Where things were that are ``gone`` is drawn in grey, with the stamp of when they went.
         """
         self._up = graph.up
         rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
@@ -194,6 +193,8 @@ class RerunLog:
         left = [f"{thing.title}, gone at {(thing.gone_ns or 0) / 1e9:.1f} s" for thing in gone]
         self._log_boxes("gone", gone, colors=GONE_COLOR, labels=left, show_labels=True)
 
+    def log_changes(self, changes: Sequence[ObjectChange]) -> None:
+        """What has become of things since the map of before, in colours of their own; of what was moved an arrow."""
         colors = [CHANGE_COLORS[change.kind] for change in changes]
         names = [f"{c.object.class_name} {c.object.id}: {c.kind}" for c in changes]
         self._log_boxes("changes", [c.object for c in changes], colors=colors, labels=names, show_labels=True)

@@ -77,6 +77,7 @@ class MapShow:
         self._log.set_time(stamp_ns)
         self._show_graph(snapshot)  # it knows which way is up
         self._log.log_map(thinned(surface_points(snapshot, surface_voxels(snapshot))))
+        self._log.log_changes(self._changes())  # last: a mapper may take a while to answer
 
     def _show_graph(self, snapshot: MapSnapshot) -> None:
         """Rooms and things, now and then; none where lengths are not metres, or the floor is not known yet."""
@@ -84,7 +85,7 @@ class MapShow:
             return
         self._graph = self._graph or GraphTracker()
         try:
-            self._log.log_graph(self._graph.update(snapshot), self._graph.gone, self._changes())
+            self._log.log_graph(self._graph.update(snapshot), self._graph.gone)
         except MapError as error:
             _log.debug("graph_not_shown", reason=str(error))
         self._graph_at = time.monotonic() + GRAPH_S
@@ -128,7 +129,8 @@ def show_saved(path: Path, begin: Begin) -> None:
     log.note_scale(voxel_map.scale_known)
     if (graph := find_graph(voxel_map)) is not None:
         memory = RememberedObjects.of_saved(ObjectMemory.from_bytes(voxel_map.objects).objects)
-        log.log_graph(graph, changes=memory.changes)
+        log.log_graph(graph)
+        log.log_changes(memory.changes)
     log.finish(voxel_map.points())
 
 

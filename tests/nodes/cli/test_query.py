@@ -149,7 +149,7 @@ def test_nearest_names_the_thing_that_instances_and_the_graph_list(monkeypatch: 
 def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
     chest: Box = ("table", (0.3, 0.3, 0.0), (0.8, 0.8, 0.4))
     moved: Box = ("table", (4.0, 2.0, 0.0), (4.5, 2.5, 0.4))
-    view = Place("front", 1, np.eye(4), np.ones((1, 3), np.float32), np.zeros((1, DESCRIPTOR_BYTES), np.uint8))
+    view = Place("front", 5, np.eye(4), np.ones((1, 3), np.float32), np.zeros((1, DESCRIPTOR_BYTES), np.uint8))
     for name, stamp_ns, thing in (("yesterday", 10, chest), ("today", 20, moved)):
         saved = VoxelMap.received(house_changes([*two_rooms(), thing], 0), VOXEL_M, LABELS)
         saved.last_stamp_ns = stamp_ns
