@@ -13,7 +13,7 @@ import struct
 import tempfile
 import types
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Union, cast, get_args, get_origin, get_type_hints
@@ -141,6 +141,8 @@ def _example(name: str, hint: Any) -> Any:
         return _example(name, get_args(hint)[0])
     if get_origin(hint) is tuple:
         return tuple(_example("", part) for part in get_args(hint) if part is not Ellipsis)
+    if get_origin(hint) is Mapping:
+        return {_example("", get_args(hint)[0]): _example("", get_args(hint)[1])}
     if hint in (int, float, bool, str):
         return hint(1)
     fields = {key: part for key, part in get_type_hints(hint, include_extras=True).items() if part not in _CLASS_VARS}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import product
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from semantic_mapper.types import Float32, Float64, Int64
 
@@ -71,7 +71,7 @@ def _tone(veneer: Veneer, q: Float64, m: int) -> Float64:
     q = q / veneer.scale_m[m]
     grain = Grain(int(veneer.grain[m]))
     stretch = np.array((1.0, 1.0, 0.06)) if grain in (Grain.FIBRE, Grain.RINGS) else 1.0
-    n = map_coordinates(veneer.noise, (q * stretch).T * 8.0 + 7.0 * m, order=1, mode="grid-wrap").astype(np.float64)
+    n = _between(veneer.noise, q * stretch * 8.0 + 7.0 * m)
     if grain == Grain.RINGS:
         return np.abs(((np.hypot(q[:, 0] + 9.0, q[:, 1]) + 0.8 * n) % 1.0) ** 0.7 * 2.0 - 1.0)
     if grain == Grain.VEINS:
@@ -92,3 +92,14 @@ def veneered(veneer: Veneer, lit: Float32, normal: Float64, points: Float64, mat
     """Light (N, 3) on white surfaces -> that of veneered ones; unit normals and places (N, 3), materials (N,)."""
     above = 1.0 + 0.5 * (veneer.sky - 1.0) * normal[:, 2:]
     return (lit * above * reflectance(veneer, points, material)).astype(np.float32)
+
+
+def _between(noise: Float32, at: Float64) -> Float64:
+    """The periodic noise (N,) between its numbers, at places (N, 3) in these; linear."""
+    low = np.floor(at)
+    part, low = at - low, low.astype(np.int64)
+    out = np.zeros(len(at))
+    for corner in product((0, 1), repeat=3):
+        weight = np.where(corner, part, 1.0 - part).prod(axis=1)
+        out += weight * noise[tuple(((low + corner) % _SIDE).T)]
+    return out

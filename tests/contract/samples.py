@@ -114,7 +114,7 @@ def questions() -> dict[str, dict[str, Any]]:
         "points_in_box": {**who, **box},
         "instances": {**who, "up": (0.0, 0.0, 1.0)},
         "objects": {**who, "up": (0.0, 0.0, 1.0)},
-        "find": {**who, "phrase": "red chair", "limit": 3, "up": None},
+        "find": {**who, "phrase": "cabinet", "limit": 3, "up": (0.0, 0.0, 1.0)},
         "occupancy": {**who, "points": points},
         "pose": who,
         "distance_field": {**who, **box, "unknown_is_occupied": True},
