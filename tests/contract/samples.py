@@ -185,7 +185,7 @@ def answers() -> dict[str, Any]:
         "points_in_box": MapPoints(xyz, rgb, u8, f4, measured),
         "instances": (thing,),
         "objects": RememberedObjects((remembered,), 5),
-        "find": (FoundObject(remembered, 0.5, {"class": 0.75, "color": 0.5}, "kitchen", np.eye(4)),),
+        "find": (FoundObject(remembered, 0.5, {"class": 0.75}, "kitchen", np.eye(4)),),
         "occupancy": u8 % 3,
         "pose": CameraPose("rooms", 7, np.eye(4)),
         "distance_field": DistanceField(np.array((0.0, 0.1, 0.2)), 0.05, f4.reshape(1, 1, 3), u8.reshape(1, 1, 3) % 3),
