@@ -146,8 +146,9 @@ def watching_live(live: Live, path: Path, told: list[str]) -> Iterator[StopReque
         assert not watcher.is_alive()
 
 
-def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None:
-    frames = tiny_frames()[:3]
+def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, shown, show = tiny_frames()[:3], threading.Event(), sources.MapShow.show
+    monkeypatch.setattr(sources.MapShow, "show", lambda *state: (show(*state), shown.set()))
     told: list[str] = []
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:
         live = Live(f"ipc://{folder}/query", (f"ipc://{folder}/camera",))
@@ -158,6 +159,7 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
                 for frame in frames:
                     publisher.publish(encode_frame(frame))
                     publisher.publish(encode(update_for(frame, LABELS.ids[0])))
+                assert shown.wait(60)
                 publisher.publish(encode(EndOfStream("camera", "end", len(frames))))
                 assert eventually(lambda: "the stream has ended" in told, 60)
                 assert eventually(lambda: not publisher.subscribers("frame"), 10), "the camera may go"
