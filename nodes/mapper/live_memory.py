@@ -18,9 +18,9 @@ from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.objects import ObjectMemory
+from semantic_mapper.queries.objects import ObjectMemory, bring_up
 from semantic_mapper.queries.questions import Point, RememberedObjects
-from semantic_mapper.queries.revisit import Looks, MapVisit
+from semantic_mapper.queries.revisit import MapVisit
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport.endpoints import Closing
 from semantic_mapper.types import Float64
@@ -131,11 +131,7 @@ class LiveMemory(Closing):
         up = graphs.up_in(snapshot)
         things = tuple(thing for thing in self._tracker().find(snapshot, up).things if not thing.unsure)
         graph = graphs.update(snapshot, things)
-        looks = Looks.of(voxel_map.places.places, memory.last_ns)
-        later = snapshot.versions > (voxel_map.objects_version if len(memory) else -1)
-        changed = snapshot.packed[later], voxel_map.stamps_of(snapshot.versions[later])
-        memory.update(MapVisit(snapshot, things, looks, voxel_map.last_stamp_ns, changed), up, graph.room_of, before)
-        voxel_map.objects, voxel_map.objects_version = memory.to_bytes(), snapshot.version
+        bring_up(voxel_map, memory, snapshot, graph, before)
         return Remembered(snapshot, up, RememberedObjects(memory.objects, self._since_ns))
 
     def counters(self) -> dict[str, int]:

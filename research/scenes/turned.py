@@ -302,12 +302,8 @@ def _counter(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
 
 def _refrigerator(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     """Round-shouldered, of one door or two, with a bar of a handle."""
-    m, w, d, h = (
-        s.pick("plain", "thing", "stone"),
-        rng.uniform(0.55, 0.75),
-        rng.uniform(0.55, 0.68),
-        rng.uniform(1.4, 1.9),
-    )
+    m = s.pick("plain", "thing", "stone")
+    w, d, h = rng.uniform((0.55, 0.55, 1.4), (0.75, 0.68, 1.9)).tolist()
     split = h * rng.uniform(0.6, 0.72)
     a.pillow(m, (0, d / 2, split / 2 + 0.02), (w, d, split))
     a.pillow(m, (0, d / 2, (h + split) / 2), (w, d, h - split))
@@ -335,12 +331,8 @@ def _sink(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
 
 def _bathtub(a: Assembly, rng: np.random.Generator, s: Stock) -> None:
     """An oval that stands free on balls."""
-    m, w, d, high = (
-        s.pick("plain", "stone", "thing"),
-        rng.uniform(1.4, 1.8),
-        rng.uniform(0.7, 0.85),
-        rng.uniform(0.5, 0.62),
-    )
+    m = s.pick("plain", "stone", "thing")
+    w, d, high = rng.uniform((1.4, 0.7, 0.5), (1.8, 0.85, 0.62)).tolist()
     for k in range(8):
         f = 0.72 + 0.28 * (k / 7) ** 0.6
         a.cylinder(m, (0, d / 2, 0.1 + (k + 0.5) * (high - 0.1) / 8), (w * f * 0.95, d * f * 0.95, (high - 0.1) / 8))

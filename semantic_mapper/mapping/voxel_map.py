@@ -222,15 +222,12 @@ class VoxelMap:
             self.epoch += 1
 
     def changed_stamps(self, since: int) -> tuple[Int64, Int64]:
-        """Packed keys (B,) of the blocks that have changed after a version, sorted, and ``stamps_of`` each."""
+        """Packed keys (B,) of the blocks that have changed after a version, sorted, and stamps (B,) of the frames that
+        changed each last, or of the next ones of which it is known."""
         with _KERNEL_LOCK:
             packed, versions = self._grid.versions_since(since)
-        return packed, self.stamps_of(versions)
-
-    def stamps_of(self, versions: Int64) -> Int64:
-        """Stamps (N,) of the frames that made versions (N,), or of the next one of which it is known."""
-        known = np.array((*self._stamps, (2**62, self.last_stamp_ns)), np.int64)
-        return known[np.searchsorted(known[:, 0], versions), 1]
+            known = np.array((*self._stamps, (2**62, self.last_stamp_ns)), np.int64)
+        return packed, known[np.searchsorted(known[:, 0], versions), 1]
 
     def points(self, min_weight: float = SURFACE_WEIGHT, *, unknown_below: float | None = None) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order; 1 as ``min_weight`` = only what was

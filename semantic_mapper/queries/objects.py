@@ -42,7 +42,7 @@ from semantic_mapper.queries.revisit import (
     signature_of,
     touching,
 )
-from semantic_mapper.queries.snapshot import MapMirror
+from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
 from semantic_mapper.transport.images import zstd_compress, zstd_decompress
 from semantic_mapper.types import Float64, UInt8
 
@@ -389,12 +389,19 @@ def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph 
         graph = tracker.update(snapshot)
     except MapError:
         return None
+    bring_up(voxel_map, memory, snapshot, graph, before)
+    return graph
+
+
+def bring_up(
+    voxel_map: VoxelMap, memory: ObjectMemory, snapshot: MapSnapshot, graph: SceneGraph, before: MapVisit | None
+) -> None:
+    """Take the things of a state of a map, which its ``graph`` has, over into what the map remembers, ``memory``."""
     looks = Looks.of(voxel_map.places.places, memory.last_ns)
     changed = voxel_map.changed_stamps(voxel_map.objects_version if len(memory) else -1)
     now = MapVisit(snapshot, graph.things, looks, voxel_map.last_stamp_ns, changed)
     memory.update(now, graph.up, graph.room_of, before)
     voxel_map.objects, voxel_map.objects_version = memory.to_bytes(), snapshot.version
-    return graph
 
 
 def visit_of(voxel_map: VoxelMap) -> MapVisit:
