@@ -14,7 +14,7 @@ TEST_SEEDS = range(200_000, 200_020)
 
 Programme = Literal["bedroom", "living", "office", "kitchen", "bathroom", "studio"]
 Style = Literal["rooms", "turned"]
-DepthSensorName = Literal["oak_d", "d435", "exact", "none"]
+DepthSensorName = Literal["oak_d", "d435", "kinect", "exact", "none"]
 
 
 class RoomConfig(Config, frozen=True):

@@ -101,6 +101,7 @@ CLUTTER: dict[str, tuple[str, ...]] = {
     "studio": (*_COMMON, *_KITCHEN, "table_lamp", "photo_frame", "laptop"),
 }  # fmt: skip
 
+_ODD = ("odd_thing",) * 6
 _BOARD = ("tray", "mixing_bowl", "board", "board", "jug")
 
 # What varied rooms hold before all else, and on their tables beside what others do (``RoomConfig.variety``).
@@ -116,8 +117,8 @@ VARIED: dict[str, tuple[Entry, ...]] = {
     "studio": (Entry("any_refrigerator", 0.6), Entry("any_table", 0.6), Entry("open_cupboard", 0.4)),
 }  # fmt: skip
 VARIED_CLUTTER: dict[str, tuple[str, ...]] = {
-    "bedroom": ("tray", "jug"), "living": _BOARD, "office": ("tray",), "kitchen": (*_BOARD, *_BOARD),
-    "bathroom": ("jug", "tray"), "studio": _BOARD,
+    "bedroom": ("tray", "jug", *_ODD), "living": (*_BOARD, *_ODD), "office": ("tray", *_ODD),
+    "kitchen": (*_BOARD, *_BOARD, *_ODD), "bathroom": ("jug", "tray", *_ODD), "studio": (*_BOARD, *_ODD),
 }  # fmt: skip
 
 

@@ -38,6 +38,7 @@ class StereoSensor:
         max_depth_m: Farther things are not measured.
         min_texture: Local contrast in grey levels below which matching fails; 0 for a sensor with a projector.
         min_return: Grey levels over square metres below which the projector's pattern is lost; 0 for a passive one.
+        slanted: Surfaces return less of the pattern the flatter they are seen, as those before a laser's dots do.
     """
 
     baseline_m: float
@@ -47,11 +48,13 @@ class StereoSensor:
     max_depth_m: float
     min_texture: float
     min_return: float
+    slanted: bool = False
 
 
 STEREO_SENSORS: dict[str, StereoSensor] = {
     "oak_d": StereoSensor(0.075, 0.12, 1 / 8, 95.0, 12.0, 1.1, 0.0),
     "d435": StereoSensor(0.050, 0.08, 1 / 32, 126.0, 8.0, 0.0, 2.0),
+    "kinect": StereoSensor(0.075, 0.1, 1 / 8, 175.0, 8.0, 0.0, 4.0, slanted=True),  # the first: structured light
 }
 
 
@@ -87,7 +90,8 @@ def measure_depth(
     if model.min_texture > 0:
         seen &= _has_texture(rgb, model.min_texture, rng)
     if model.min_return > 0:
-        seen &= _returns_light(rgb, exact_m, model.min_return, rng)
+        level = _facing(exact_m, intrinsics) if model.slanted else 1.0
+        seen &= _returns_light(rgb, exact_m, model.min_return / level, rng)
     depth = focal_base / np.where(seen, noisy, 1.0)
     return np.where(seen & (depth <= model.max_depth_m), depth, 0.0).astype(np.float32)
 
@@ -134,7 +138,15 @@ def smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Float32:
     return field / max(float(field.std()), 1e-6)
 
 
-def _returns_light(rgb: UInt8, exact_m: Float32, least: float, rng: np.random.Generator) -> np.ndarray:
+def _facing(exact_m: Float32, intrinsics: CameraIntrinsics) -> Float32:
+    """(H, W) cosine of the angle at which surfaces are seen, at least 0.05."""
+    z = np.maximum(exact_m, 1e-3)
+    across = np.gradient(z, axis=1) * np.float32(intrinsics.fx) / z
+    down = np.gradient(z, axis=0) * np.float32(intrinsics.fy) / z
+    return np.maximum(1.0 / np.sqrt(1.0 + across * across + down * down), np.float32(0.05))
+
+
+def _returns_light(rgb: UInt8, exact_m: Float32, least: Float32 | float, rng: np.random.Generator) -> np.ndarray:
     """(H, W) bool: the projected pattern is bright enough; it gets weaker with the square of range."""
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (5, 5), 1.2).astype(np.float32) + 8.0
     threshold = least * np.exp(0.5 * smooth_noise(grey.shape, rng))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from research.train.appearance import vary_appearance
+from research.train.appearance import strew, vary_appearance
 from semantic_mapper.config import AtLeastOne, Config, Fraction, Positive
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import to_device
@@ -46,6 +46,7 @@ class ImageStepConfig(Config, frozen=True):
     cropped: Fraction = 0.0  # fraction of images of which a part is shown, half to all of each side, at full size
     colour_jitter: float = 0.25
     appearance: Fraction = 0.0  # fraction of images with another light, texture and sharpness; see ``appearance``
+    clutter: Fraction = 0.0  # fraction of images with pieces of others strewn on them; see ``appearance.strew``
     balance: Fraction = 0.25  # see ``losses.image_loss``
     depth: float = 0.05  # weight of ``losses.guess_loss``: images without depth learn it, too
 
@@ -83,10 +84,13 @@ def image_batch(
     withheld = 1.0 if colours_only else 0.0 if config.frozen_colours else config.depth_dropout
     sources = withhold_depth(replace(stacked, channel=None), withheld, generator)
     sources = jitter_colours(to_device(sources, device), config.colour_jitter, generator)
-    channel = stacked.channel.to(device)
+    channel, depth_m = stacked.channel.to(device), stacked.depth_m.to(device)
+    if config.clutter > 0:
+        sources, channel = strew(sources, channel, config.clutter, generator)
+        depth_m = depth_m * (channel >= 0)  # of what a piece hides, nothing is to be learned
     if config.appearance > 0:
         sources = vary_appearance(sources, channel, config.appearance, generator)
-    return ImageBatch(sources, channel, stacked.depth_m.to(device))
+    return ImageBatch(sources, channel, depth_m)
 
 
 def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig) -> Loss:

@@ -181,6 +181,21 @@ def jug(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     a.box(material, (w * 0.5, 0, h * 0.6), (w * 0.3, 0.015, h * 0.45))
 
 
+@furniture("otherprop", "small")
+def odd_thing(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Nothing that has a name: one to five bodies of any shape, size and material, stacked or leaning."""
+    z = 0.0
+    for _ in range(int(rng.integers(1, 6))):
+        w, d = 0.06 * 5 ** rng.uniform(0, 1, 2)
+        h = 0.01 * 25 ** rng.uniform()
+        add = (a.box, a.box, a.cylinder, a.ellipsoid, a.frustum, a.pillow)[int(rng.integers(6))]
+        material = palette.pick(rng, "object", "print", "paper", "fabric", "dark", "metal", "ceramic", "books", "plant")
+        shift = rng.uniform(-0.25, 0.25, 2) * (w, d)
+        add(material, (float(shift[0]), float(shift[1]), z + h / 2), (w, d, h), yaw=rng.uniform(-1.6, 1.6))
+        if rng.uniform() < 0.7:
+            z += h
+
+
 def _hollow(a: Assembly, outside: int, inside: int, size: tuple[float, float, float], shelves: int) -> None:
     """A carcass open towards y, with shelves; a solid one where there are none."""
     w, d, h = size

@@ -69,6 +69,15 @@ def test_the_passive_sensor_fails_on_blank_surfaces_and_the_active_one_does_not(
     assert (measure_depth(flat(2.0), blank, CAMERA, "d435", rng(0)) == 0).mean() < 0.01
 
 
+def test_structured_light_is_lost_on_dark_floors_that_are_seen_at_a_flat_angle() -> None:
+    dark = np.full((*SIZE, 3), 30, np.uint8)
+    down = (np.arange(SIZE[0]) - SIZE[0] / 2)[:, None] / CAMERA.fy
+    floor = np.broadcast_to(np.where(down > 0.05, 0.4 / np.maximum(down, 0.05), 0.0), SIZE).astype(np.float32)
+    far, facing = (floor > 1.5) & (floor < 2.5), flat(2.0)
+    measured = [measure_depth(z, dark, CAMERA, "kinect", np.random.default_rng(0)) for z in (floor, facing)]
+    assert (measured[0][far] == 0).mean() > 0.5 and (measured[1] == 0).mean() < 0.2
+
+
 def test_a_band_beside_a_near_thing_is_hidden_from_the_other_eye() -> None:
     disparity = np.full((1, 40), 2.0, np.float32)
     disparity[0, 20:30] = 8.0
@@ -77,7 +86,9 @@ def test_a_band_beside_a_near_thing_is_hidden_from_the_other_eye() -> None:
     np.testing.assert_array_equal(np.flatnonzero(hidden[0]), np.arange(14, 20))
 
 
-@pytest.mark.parametrize(("sensor", "least", "most"), [("oak_d", 0.08, 0.5), ("d435", 0.01, 0.2)])
+@pytest.mark.parametrize(
+    ("sensor", "least", "most"), [("oak_d", 0.08, 0.5), ("d435", 0.01, 0.2), ("kinect", 0.03, 0.4)]
+)
 def test_depth_of_rooms_has_a_realistic_share_of_holes_and_stays_near_the_truth(
     sensor: str, least: float, most: float
 ) -> None:
