@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from research.scenes.furniture import FURNITURE
+from research.scenes.furniture.varied import VARIANTS
 from research.scenes.materials import Palette
 from research.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z, scaled
 from research.scenes.shell import Shell, build_shell, wall_pose
@@ -57,6 +58,8 @@ class Layout:
 
     def make(self, name: str, rng: np.random.Generator | None = None) -> Assembly:
         """A specimen of a piece, drawn by ``rng`` or else the room's; in a varied room, each kind has its own size."""
+        if self.variety is not None and name in VARIANTS and self.variety.uniform() < 0.5:
+            name = VARIANTS[name]
         piece = FURNITURE[name].make(self.rng if rng is None else rng, self.palette)
         if self.variety is None:
             return piece

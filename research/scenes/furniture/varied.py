@@ -9,6 +9,12 @@ from research.scenes.furniture.registry import furniture
 from research.scenes.materials import Palette
 from research.scenes.primitives import Assembly, Top
 
+# In half of the cases varied rooms hold the second in place of the first.
+VARIANTS = {
+    "window": "any_window", "door": "any_door", "picture": "any_picture", "counter": "any_counter",
+    "bathtub": "any_bathtub", "toilet": "any_toilet", "wash_basin": "any_basin",
+}  # fmt: skip
+
 _RETURN_D_M = 0.62  # depth of the short run of an L
 
 
@@ -194,6 +200,227 @@ def odd_thing(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         add(material, (float(shift[0]), float(shift[1]), z + h / 2), (w, d, h), yaw=rng.uniform(-1.6, 1.6))
         if rng.uniform() < 0.7:
             z += h
+
+
+@furniture("window", "hang")
+def any_window(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A ribbon, down to the floor, arched or round; by day, at night or frosted; many bars or none; often a blind."""
+    form = ("square", "ribbon", "tall", "arched", "round")[int(rng.integers(5))]
+    w = {"ribbon": rng.uniform(1.4, 2.4), "round": rng.uniform(0.5, 0.9)}.get(form, rng.uniform(0.45, 1.6))
+    tall = {"ribbon": rng.uniform(0.4, 0.7), "tall": rng.uniform(1.7, 2.1), "round": w}.get(form, rng.uniform(0.7, 1.4))
+    low = {"ribbon": rng.uniform(1.1, 1.6), "tall": 0.1}.get(form, rng.uniform(0.7, 1.1))
+    lit = rng.uniform() < 0.4
+    pane = palette.pick(rng, "daylight") if lit else palette.pick(rng, "dark", "screen", "wallpaint", "ceramic")
+    frame, mid = palette.pick(rng, "paint", "wood", "metal", "dark"), low + tall / 2
+    edge, deep = rng.uniform(0.03, 0.12), rng.uniform(0.02, 0.1)
+    if form == "round":
+        a.cylinder(frame, (0, deep / 2, mid), (w + 2 * edge, w + 2 * edge, deep), tilt=np.pi / 2)
+        a.cylinder(pane, (0, deep / 2 + 0.004, mid), (w, w, deep), tilt=np.pi / 2, casts_shadow=False)
+    else:
+        if form == "arched":
+            a.cylinder(frame, (0, deep / 2, low + tall), (w + 2 * edge, w + 2 * edge, deep - 0.004), tilt=np.pi / 2)
+            a.cylinder(pane, (0, deep / 2 + 0.002, low + tall), (w, w, deep - 0.004), tilt=np.pi / 2)
+        a.box(frame, (0, deep / 2, mid), (w + 2 * edge, deep, tall + 2 * edge))
+        a.box(pane, (0, deep / 2 + 0.004, mid), (w, deep, tall), casts_shadow=False)
+    bar = rng.uniform(0.015, 0.06)
+    for k in range(int(rng.integers(0, 5))):
+        a.box(
+            frame, ((rng.uniform(-0.4, 0.4) if k > 3 else (k - 1) / 4) * w, deep + 0.01, mid), (bar, 0.02, tall * 0.98)
+        )
+    for k in range(int(rng.integers(0, 4))):
+        a.box(frame, (0, deep + 0.009, low + tall * (k + 1) / 4), (w * 0.98, 0.018, bar))
+    if lit:
+        a.lamps.append((0, 0.35, mid))
+    if rng.uniform() < 0.5 and form != "round":
+        shut, cloth = tall * rng.uniform(0.2, 1.0), palette.pick(rng, "fabric", "paper", "wood", "metal", "paint")
+        top, front = low + tall + edge, deep + 0.05
+        if rng.uniform() < 0.5:  # one piece of cloth
+            a.box(cloth, (0, front, top - shut / 2), (w + edge, 0.01, shut), label="curtain", item=1)
+            return
+        for k in range(slats := max(2, round(shut / 0.06))):
+            at = (0.0, front, top - (k + 0.5) * shut / slats)
+            a.box(cloth, at, (w + edge, 0.045, 0.006), label="curtain", item=1, tilt=rng.uniform(0.6, 0.7))
+
+
+@furniture("door", "hang", keep_free_m=0.7)
+def any_door(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """One leaf or two, of wood, metal or glass in a frame, panelled, slatted or sliding; knob, bar or plate."""
+    leaves, h = 1 + int(rng.uniform() < 0.25), rng.uniform(1.9, 2.25)
+    each = rng.uniform(0.65, 1.05) if leaves == 1 else rng.uniform(0.5, 0.75)
+    leaf = palette.pick(rng, "wood", "paint", "metal", "dark", "lacquer", "steel", "ceramic", role="door")
+    frame = leaf if rng.uniform() < 0.3 else palette.pick(rng, "wood", "paint", "metal", "dark")
+    metal, style, w = palette.pick(rng, "metal", "dark"), int(rng.integers(5)), leaves * each
+    edge = rng.uniform(0.03, 0.14)
+    if style != 4:  # a sliding one has no frame but a rail
+        a.box(frame, (0, 0.01, h / 2 + edge / 2), (w + 2 * edge, 0.02, h + edge))
+    else:
+        a.box(metal, (0, 0.06, h + 0.03), (w * 1.6, 0.03, 0.05))
+    for k in range(leaves):
+        x = (k - (leaves - 1) / 2) * each
+        a.box(leaf, (x, 0.03, h / 2), (each - 0.01, 0.045, h - 0.01))
+        if style == 0:
+            glass = palette.pick(rng, "daylight", "dark", "screen", "ceramic")
+            a.box(glass, (x, 0.033, h / 2 + 0.08), (each * 0.7, 0.046, h * 0.76))
+        for z in np.arange(0.15, h - 0.15, 0.09) if style == 1 else ():
+            a.box(leaf, (x, 0.055, float(z)), (each * 0.75, 0.02, 0.05), tilt=0.5)
+        for z in np.linspace(0.1, 0.9, int(rng.integers(2, 6))) if style in (2, 4) else ():
+            a.box(frame, (x, 0.056, float(z) * h), (each * 0.85, 0.012, 0.08))
+        side = 1 if k == 0 else -1
+        size = ((0.05, 0.06, 0.05), (0.03, 0.05, 0.35), (0.12, 0.03, 0.2))[int(rng.integers(3))]
+        a.box(metal, (x + side * (each / 2 - 0.09), 0.07, 1.0), size)
+
+
+@furniture("picture", "hang")
+def any_picture(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A canvas without a frame, a poster, two or three of a kind, or a round one."""
+    count, z = int(rng.choice((1, 1, 1, 2, 3))), rng.uniform(1.3, 1.8)
+    w, tall = rng.uniform(0.15, 1.2) / count**0.5, rng.uniform(0.15, 1.1)
+    deep = rng.choice((0.004, 0.015, 0.04))
+    for k in range(count):
+        sight = palette.pick(rng, "print", "paper", "fabric", "object", "screen", "plant", role="picture")
+        x = (k - (count - 1) / 2) * (w + 0.05)
+        if rng.uniform() < 0.15:
+            a.cylinder(sight, (x, deep / 2, z), (w, w, deep), tilt=np.pi / 2)
+            continue
+        a.box(sight, (x, deep / 2, z), (w, deep, tall))
+        for _ in range(int(rng.integers(0, 5))):  # what it shows
+            part = (rng.uniform(0.1, 0.6) * w, deep + 0.002, rng.uniform(0.1, 0.6) * tall)
+            at = (
+                x + rng.uniform(-0.5, 0.5) * (w - part[0]),
+                part[1] / 2,
+                z + rng.uniform(-0.5, 0.5) * (tall - part[2]),
+            )
+            a.box(palette.pick(rng, "print", "object", "paper", "plant", "dark", "daylight"), at, part)
+
+
+@furniture("counter", "wall", keep_free_m=0.6)
+def any_counter(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A worktop on legs, drawers, panels, curtains or shelves, with a sink or none."""
+    w, d, h = rng.uniform(0.9, 3.0), rng.uniform(0.45, 0.8), rng.uniform(0.82, 1.12)
+    thick, kind = rng.uniform(0.02, 0.1), int(rng.integers(5))
+    top = palette.pick(rng, "stone", "tile", "wood", "dark", "paint", "steel", "metal", "ceramic", role="counter")
+    body = palette.pick(rng, "wood", "paint", "lacquer", "metal", "steel", "dark", "tile", role="cabinet")
+    metal, under = palette.pick(rng, "metal", "dark"), h - thick
+    a.box(top, (0, d / 2, h - thick / 2), (w, d, thick))
+    if rng.uniform() < 0.4:
+        a.box(top, (0, 0.01, h + 0.08), (w, 0.02, 0.16))
+    if kind in (0, 1):  # open: legs and one or two boards
+        for x in (-1, 1):
+            for y in (0.05, d - 0.05):
+                a.box(metal, (x * (w / 2 - 0.05), y, under / 2), (0.05, 0.05, under))
+        for z in (0.15, 0.5)[: kind + 1]:
+            a.box(body, (0, d / 2, z), (w - 0.02, d - 0.06, 0.03))
+            for x in np.arange(-w / 2 + 0.25, w / 2 - 0.2, 0.45):
+                if rng.uniform() < 0.6:
+                    add = (a.box, a.cylinder, a.pillow)[int(rng.integers(3))]
+                    size = (rng.uniform(0.12, 0.35), rng.uniform(0.12, 0.35), rng.uniform(0.06, 0.28))
+                    thing = palette.pick(rng, "object", "metal", "ceramic", "fabric", "paper")
+                    add(
+                        thing,
+                        (float(x), d / 2, z + 0.015 + size[2] / 2),
+                        size,
+                        label="otherprop",
+                        item=40 + round(9 * x),
+                    )
+    else:
+        inset = rng.uniform(0.0, 0.15) if kind == 4 else 0.03
+        a.box(body, (0, (d - inset) / 2, under / 2), (w - 0.01, d - inset, under), label="cabinet", item=1)
+        columns = max(1, round(w / rng.uniform(0.35, 0.9)))
+        rows = 1 if kind == 4 else int(rng.integers(1, 5))
+        for column in range(columns if kind != 4 or rng.uniform() < 0.5 else 0):
+            for row in range(rows):
+                each, high = w / columns, (under - 0.1) / rows
+                at = ((column + 0.5) * each - w / 2, d - inset + 0.006, 0.1 + (row + 0.5) * high)
+                front = palette.pick(rng, "fabric", role="curtain") if kind == 3 and rows == 1 else body
+                a.box(front, at, (each - 0.02, 0.016, high - 0.02), label="cabinet", item=1)
+                a.box(metal, (at[0], at[1] + 0.02, at[2] + high * 0.3), (0.1, 0.02, 0.015), label="cabinet", item=1)
+    if rng.uniform() < 0.5:  # a sink that stands on it or lies in it
+        x, bowl = rng.uniform(-0.3, 0.3) * (w - 0.5), palette.pick(rng, "metal", "ceramic", "steel", "stone")
+        size = (rng.uniform(0.35, 0.6), min(d - 0.14, 0.45), rng.uniform(0.01, 0.16))
+        (a.box, a.pillow, a.cylinder)[int(rng.integers(3))](
+            bowl, (x, d / 2 + 0.04, h + size[2] / 2), size, label="sink"
+        )
+        a.box(metal, (x, 0.06, h + 0.14), (0.03, 0.03, 0.28), label="sink")
+        a.box(metal, (x, 0.14, h + 0.27), (0.025, 0.16, 0.025), label="sink")
+    else:
+        a.tops.append(Top(-w / 2, w / 2, 0.03, d, h))
+
+
+@furniture("bathtub", "corner", keep_free_m=0.4)
+def any_bathtub(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A full tub: oval and free on feet, square in a tiled step, or short and deep, of any colour."""
+    w, d, h = rng.uniform(1.0, 1.9), rng.uniform(0.65, 1.1), rng.uniform(0.4, 0.8)
+    shell = palette.pick(rng, "ceramic", "ceramic", "lacquer", "dark", "metal", "stone")
+    inside, metal = palette.pick(rng, "ceramic", "ceramic", "tile", "metal"), palette.pick(rng, "metal", "dark")
+    if rng.uniform() < 0.5:
+        a.frustum(shell, (0, d / 2, h / 2 + 0.04), (w, d, h - 0.08), tilt=np.pi)
+        a.torus(shell, (0, d / 2, h - 0.02), (w, d, 0.08))
+        a.cylinder(inside, (0, d / 2, h - 0.06), (w * 0.86, d * 0.82, 0.03))
+        for x in (-1, 1):
+            a.ellipsoid(metal, (x * w * 0.3, d / 2, 0.05), (0.1, d * 0.5, 0.1))
+    else:
+        step = palette.pick(rng, "tile", "wood", "stone", "paint")
+        rim = rng.uniform(0.05, 0.2)
+        a.box(step, (0, d / 2, h / 2 - 0.02), (w, d, h - 0.04))
+        for x in (-1, 1):
+            a.box(shell, (x * (w - rim) / 2, d / 2, h - 0.01), (rim, d, 0.06))
+        for y in (rim / 2, d - rim / 2):
+            a.box(shell, (0, y, h - 0.01), (w - 2 * rim, rim, 0.058))
+        a.pillow(inside, (0, d / 2, h - 0.05), (w - 2 * rim, d - 2 * rim, 0.05))
+    x = rng.uniform(-0.4, 0.4) * w
+    a.cylinder(metal, (x, 0.04, h + 0.12), (0.04, 0.04, 0.3))
+    a.box(metal, (x, 0.12, h + 0.25), (0.03, 0.18, 0.03))
+
+
+@furniture("toilet", "wall", keep_free_m=0.4)
+def any_toilet(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """On the wall, on the floor or under a tank high up; round or square, of any colour."""
+    body = palette.pick(rng, "ceramic", "ceramic", "ceramic", "lacquer", "dark")
+    seat, metal = palette.pick(rng, "ceramic", "wood", "dark", "lacquer"), palette.pick(rng, "metal", "dark", "ceramic")
+    w, long, h = rng.uniform(0.32, 0.42), rng.uniform(0.44, 0.6), rng.uniform(0.36, 0.48)
+    add = a.pillow if rng.uniform() < 0.4 else a.cylinder
+    bottom, y = (rng.uniform(0.08, 0.2), long / 2) if rng.uniform() < 0.4 else (0.0, long / 2 + 0.05)
+    a.frustum(body, (0, y, (h + bottom) / 2), (w, long, h - bottom), tilt=np.pi)
+    add(seat, (0, y, h + 0.02), (w + 0.02, long + 0.02, 0.045))
+    if rng.uniform() < 0.4:
+        add(seat, (0, 0.05, h + long / 2), (w, long, 0.03), tilt=np.pi / 2 + 0.1)
+    tank = int(rng.integers(3))
+    if tank == 0:  # in the wall: a plate to press
+        a.box(metal, (0, 0.008, rng.uniform(0.85, 1.1)), (0.24, 0.016, 0.16))
+    elif tank == 1:
+        a.pillow(body, (0, 0.1, h + 0.24), (rng.uniform(0.32, 0.5), 0.19, rng.uniform(0.3, 0.44)))
+    else:
+        a.box(body, (0, 0.09, 1.75), (0.45, 0.17, 0.28))
+        a.cylinder(metal, (0, 0.06, 1.0), (0.04, 0.04, 1.25))
+
+
+@furniture("sink", "wall", keep_free_m=0.5)
+def any_basin(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A bowl on a board, a trough, or a round basin on the wall or on legs; mirrors are for others."""
+    w, d, h = rng.uniform(0.3, 1.1), rng.uniform(0.3, 0.5), rng.uniform(0.72, 0.95)
+    bowl, metal = (
+        palette.pick(rng, "ceramic", "ceramic", "metal", "stone", "lacquer"),
+        palette.pick(rng, "metal", "dark"),
+    )
+    deep, kind = rng.uniform(0.08, 0.2), int(rng.integers(4))
+    if kind == 0:
+        wide = w + rng.uniform(0.1, 0.5)
+        board = palette.pick(rng, "wood", "stone", "paint")
+        a.box(board, (0, d / 2 + 0.03, h - deep - 0.025), (wide, d + 0.06, 0.05), label="counter", item=1)
+        a.frustum(bowl, (0, d / 2 + 0.03, h - deep / 2), (min(w, 0.5), d, deep), tilt=np.pi)
+    elif kind == 1:
+        a.box(bowl, (0, d / 2, h - deep / 2), (w, d, deep))
+        a.box(palette.pick(rng, "dark", "metal", "ceramic"), (0, d / 2 + 0.03, h), (w - 0.08, d - 0.14, 0.006))
+    elif kind == 2:
+        a.ellipsoid(bowl, (0, d / 2, h - deep / 2), (min(w, 0.6), d, deep * 1.6))
+        a.cylinder(metal, (0, d / 2 - 0.05, (h - deep) / 2), (0.06, 0.06, h - deep))
+    else:
+        a.pillow(bowl, (0, d / 2, h - deep / 2), (w, d, deep))
+        for x in (-1, 1):
+            a.cylinder(metal, (x * (w / 2 - 0.04), d - 0.06, (h - deep) / 2), (0.035, 0.035, h - deep))
+    reach = rng.uniform(0.08, 0.2)
+    a.cylinder(metal, (0, 0.05, h + 0.08), (0.03, 0.03, rng.uniform(0.12, 0.3)))
+    a.box(metal, (0, 0.05 + reach / 2, h + 0.15), (0.025, reach, 0.025))
 
 
 def _hollow(a: Assembly, outside: int, inside: int, size: tuple[float, float, float], shelves: int) -> None:
