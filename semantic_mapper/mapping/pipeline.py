@@ -56,10 +56,12 @@ SURE = 0.8  # confidence from which on the map is believed where another field i
 OWN_WITH_LABELS = 0.25  # of the own image's weight is left where a frame is rendered from labelled views, too
 OWN_BETWEEN_RAYS = 0.5  # of it counts in the rendered view between rays, where none is labelled
 RAYS_WITHOUT_LABELS = 0.7  # of ``render.ray_fraction`` are rendered then
+RECALL_STEP = 2  # pixels of the rendered view: how finely the map is looked at where a frame has no depth
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
 
 P = ParamSpec("P")
 T = TypeVar("T")
+S = TypeVar("S", np.uint8, np.float32)
 
 
 class _FullSize(NamedTuple):
@@ -136,8 +138,9 @@ class MappingPipeline:
             if self.corrector.records:
                 self._timed("history", self.corrector.record, full.views.frame, votes)
             is_keyframe = self._timed("keyframe", self._keep_view, full.views, current, sources)
+            shown = self._timed("recall", self._recall, view, full)
             self._finish_step(views.frame)
-            return self._update(views.frame, view, full, sources, is_keyframe, touched)
+            return self._update(views.frame, view, shown, full, sources, is_keyframe, touched)
 
     def prepare(self, frame: PosedFrame) -> list[PosedFrame]:
         """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first: one frame
@@ -325,7 +328,8 @@ class MappingPipeline:
             return self._upsample(views, votes, self.voxel_map)
         full = self._upsample(self.moving.leave_out(views, moving), votes, self.voxel_map)
         if self.moving.uses_classes:
-            label, _ = self._at_rows(votes, full.rows)
+            ids = self.label_set.to_ids(likeliest(votes.probabilities)[0])
+            label = self._at_rows(ids, full.rows, self.label_set.ignore_id)
             by_class = self.moving.of_classes(label)
             if opinion is not None:
                 by_class |= np.append(opinion.moving, False)[full.rows]
@@ -415,12 +419,12 @@ class MappingPipeline:
         self,
         frame: PosedFrame,
         view: RenderedView,
+        shown: tuple[UInt8, Float32],
         full: _FullSize,
         sources: Sequence[Keyframe],
         is_keyframe: bool,
         touched: int,
     ) -> MapUpdate:
-        label, confidence = self._at_rows(view, full.rows)
         depth_m = full.depth_m
         if full.moving is not None and frame.depth_m is not None:
             depth_m = np.where(full.moving, frame.depth_m, depth_m)
@@ -431,8 +435,8 @@ class MappingPipeline:
             fused=touched > 0,
             is_keyframe=is_keyframe,
             source_seqs=tuple(k.seq for k in sources),
-            label=label,
-            confidence=confidence,
+            label=self._at_rows(shown[0], full.rows, self.label_set.ignore_id),
+            confidence=self._at_rows(shown[1], full.rows),
             depth_m=depth_m,
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
@@ -442,12 +446,33 @@ class MappingPipeline:
             moving=full.moving,
         )
 
-    def _at_rows(self, view: RenderedView, rows: Int32) -> tuple[UInt8, Float32]:
-        """Class ids and confidence (H, W) of what the pixels take from a view; row -1 is unknown."""
+    def _recall(self, view: RenderedView, full: _FullSize) -> tuple[UInt8, Float32]:
+        """Class ids and confidence (h, w) of a rendered view; the map's where the frame has no depth and the map is
+        surer: there the field guesses where the surface is, and the map has seen it. Not on what moves."""
         channel, most = likeliest(view.probabilities)
-        ids = np.append(self.label_set.to_ids(channel.ravel()), np.uint8(self.label_set.ignore_id))
-        # Twice as fast as by index.
-        return ids.take(rows, mode="wrap"), np.append(most, np.float32(0)).take(rows, mode="wrap")
+        label, frame = self.label_set.to_ids(channel), full.views.frame
+        if frame.depth_m is None or self.voxel_map.block_count == 0:
+            return label, most
+        size = label.shape[::-1]
+        hole = view.known & (full.views.depth(scale_intrinsics(frame.intrinsics, *size)) == 0)
+        if full.moving is not None:
+            hole &= ~cv2.resize(full.moving.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+        coarse = scale_intrinsics(frame.intrinsics, *(max(1, side // RECALL_STEP) for side in size))
+        wanted = cv2.resize(hole.view(np.uint8), (coarse.width, coarse.height), interpolation=cv2.INTER_AREA) > 0
+        cast = self.voxel_map.ray_cast(frame.T_world_camera, coarse, wanted)
+        found = np.asarray(cv2.resize(cast.label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        sure = np.asarray(cv2.resize(cast.confidence, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        hole &= (found != self.label_set.ignore_id) & (sure > most)
+        label[hole] = found[hole]
+        # The map counts frames that say the same for the same reason as independent ones, so it is too sure.
+        most[hole] = (sure[hole] + view.probabilities[hole, self.label_set.to_channels(found[hole])]) / 2
+        return label, most
+
+    def _at_rows(self, values: NDArray[S], rows: Int32, unknown: float = 0) -> NDArray[S]:
+        """What the pixels (H, W) take from a rendered view (h, w); row -1 is ``unknown``."""
+        return np.append(values.ravel(), np.array(unknown, values.dtype)).take(
+            rows, mode="wrap"
+        )  # twice as fast as by index
 
     # Besides the stages.
 

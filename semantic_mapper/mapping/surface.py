@@ -58,20 +58,22 @@ def _empty_readout(shape: tuple[int, ...]) -> Readout:
 
 
 def cast_view(
-    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig, wanted: Bool | None = None
 ) -> tuple[Float32, Readout]:
-    """See the map through a camera, up to ``depth_max_m`` away: depth (H, W), 0 = miss, and the rest.
+    """See the map through a camera, up to ``depth_max_m`` away: depth (H, W), 0 = miss, and the rest; where ``wanted``
+    (H, W), or everywhere.
 
     What it may see and is on disk comes back, for a part of the image after the other where memory has no room for all.
     (Where even what one pixel may see does not fit, its ray meets the nearest of that.)"""
     size = (intrinsics.height, intrinsics.width)
     depth, seen = np.zeros(size, np.float32), _empty_readout(size)
+    wanted = np.ones(size, np.bool_) if wanted is None else np.ascontiguousarray(wanted)
     lengths = config.voxel_size_m, config.truncation_voxels, config.depth_max_m
     for window, needed in _windows(grid, camera, intrinsics, config):
         if len(needed):
             grid.page_in(needed)
         memory = config.vote_discount, config.unknown_below, grid.index, grid.buffers()
-        _cast_view_rows(window.height, camera, window, *lengths, *memory, depth, seen)
+        _cast_view_rows(window.height, camera, window, *lengths, *memory, wanted, depth, seen)
     return depth, seen
 
 
@@ -184,6 +186,7 @@ def _cast_view_rows(
     unknown_below: float,
     index: BlockIndex,
     buffers: GridBuffers,
+    wanted: Bool,
     depth: Float32,
     seen: Readout,
 ) -> None:

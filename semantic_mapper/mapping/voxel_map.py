@@ -265,12 +265,13 @@ class VoxelMap:
         flat = {name: values.reshape(len(keys), -1, *values.shape[4:]) for name, values in state.items()}
         return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.changes(0, min_weight=1e-9).label)
 
-    def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
-        """The map as a camera (4, 4) would see it, up to ``depth_max_m`` away; pixel centres are integers."""
+    def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics, wanted: Bool | None = None) -> MapView:
+        """The map as a camera (4, 4) would see it, up to ``depth_max_m`` away; pixel centres are integers. Pixels that
+        are not ``wanted`` (H, W) see nothing."""
         check_pose(T_world_camera, "ray_cast")
         camera = make_camera(intrinsics, T_world_camera)
         with _KERNEL_LOCK:
-            depth_m, seen = cast_view(self._grid, camera, intrinsics, self.config)
+            depth_m, seen = cast_view(self._grid, camera, intrinsics, self.config, wanted)
         return MapView(depth_m, seen.rgb, self.label_set.to_ids(seen.channel), seen.confidence, seen.measured)
 
     def block_state(self, keys: Int32 | None = None) -> dict[str, NDArray[np.generic]]:

@@ -100,6 +100,19 @@ def test_cameras_of_two_sizes_have_each_their_own_keyframes():
     assert other[3].source_seqs and set(other[3].source_seqs) <= {100, 101, 102}
 
 
+def test_where_a_frame_has_no_depth_it_says_what_the_map_is_surer_of():
+    pipeline, frames = tiny_pipeline(), tiny_frames()
+    for frame in frames[:3]:
+        pipeline.step(frame)
+    depth, hole = frames[3].depth_m.copy(), np.zeros(frames[3].depth_m.shape, np.bool_)
+    hole[20:60, 20:80] = True
+    depth[hole] = 0
+    update = pipeline.step(replace(frames[3], depth_m=depth))
+    seen = pipeline.voxel_map.ray_cast(frames[3].T_world_camera, frames[3].intrinsics)
+    sure, agrees = seen.confidence > update.confidence, update.label == seen.label
+    assert (hole & sure).sum() > 300 and agrees[hole & sure].mean() > 0.9 > agrees[~hole & sure].mean()
+
+
 def test_frames_without_depth_are_rendered_and_fused_from_what_the_field_sees():
     # Untrained weights guess the depth of a view without depth at random, so only views with depth are sources here.
     pipeline = tiny_pipeline(keyframes={"use_current_view": False, "translation_m": 0.02}, depth={"source": "sensor"})

@@ -11,6 +11,7 @@ typedef struct {
     double vote_discount, unknown_below;
     BlockIndex index;
     GridBuffers buffers;
+    U8 wanted;      /* (H, W) */
     F32 depth;      /* (H, W) metres */
     U8 rgb;         /* (H, W, 3) */
     I64 channel;    /* (H, W) */
@@ -27,13 +28,14 @@ KERNEL(cast_view_rows, CastViewArguments) {
     for (int64_t v = a->top + start; v < a->top + stop; v++) {
         double y = ((double)v - camera->cy) / camera->fy;
         for (int64_t u = a->left; u < a->left + a->width; u++) {
+            int64_t at = v * a->depth.shape[1] + u;
+            if (!a->wanted.data[at]) continue;
             double x = ((double)u - camera->cx) / camera->fx, d[3], p[3], confidence;
             for (int axis = 0; axis < 3; axis++)
                 d[axis] = (R[3 * axis] * x + R[3 * axis + 1] * y + R[3 * axis + 2]) / a->voxel_size;
             double z = march(origin, d, a->truncation_voxels, a->z_max, &a->index, &field);
             if (z <= 0) continue;
             point_at(origin, d, z, p);
-            int64_t at = v * a->depth.shape[1] + u;
             a->channel.data[at] = read_point(p, &a->index, &a->buffers, a->vote_discount, a->unknown_below,
                                              a->rgb.data + 3 * at, &confidence, a->measured.data + at);
             a->depth.data[at] = (float)z;
