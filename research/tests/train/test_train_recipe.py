@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from research.experiments import peers
 from research.peers.kinds import build_field
 from research.train.recipe import git_revision
 from research.train.train_config import TrainConfig
@@ -48,16 +47,3 @@ def test_every_recipe_is_a_config_of_a_field_that_can_be_built(path: Path):
     assert config.seconds > 0 or config.steps > 0
     field = build_field(config.kind, config.field, ROOMS)
     assert all(part in dict(field.named_modules()) for part in config.bfloat16)
-
-
-@pytest.mark.parametrize("name", list(peers.RUNS))
-def test_recipes_of_the_comparison_are_configs_and_start_from_encoders_of_their_shape(name: str, tmp_path: Path):
-    (tmp_path / "r.toml").write_text(peers.recipe(name, peers.Budget(seed=3, steps=100)), encoding="utf-8")
-    config = load_config(tmp_path / "r.toml", TrainConfig)
-    run = peers.RUNS[name]
-    assert (config.seed, config.steps, config.kind) == (3, 100, run.kind)
-    encoder = build_field(config.kind, config.field, ROOMS).image_encoder
-    assert encoder is not None and (encoder.depth_net is not None) is run.depth
-    assert config.images.fraction == (1 if run.images else 0)
-    if not run.images:
-        assert peers.RUNS[run.encoder].depth is run.depth and peers.RUNS[run.encoder].images
