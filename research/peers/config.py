@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-from semantic_mapper.config import Channels, Config, EncoderConfig, Layers
-
-
-class NeuRayConfig(Config, frozen=True):
-    """Shape of NeuRay with a semantic head; the encoder is S-Ray's."""
-
-    feature_dim: Channels = 32  # C
-    encoder: EncoderConfig = EncoderConfig()
+from semantic_mapper.config import Channels, Config, Layers
 
 
 class SemanticNeRFConfig(Config, frozen=True):

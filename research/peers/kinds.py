@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from research.peers.config import NeuRayConfig, SemanticNeRFConfig
+from research.peers.config import SemanticNeRFConfig
 from semantic_mapper.config import Config, PanopticConfig, SamplingConfig, convert_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields import learned
@@ -12,7 +12,6 @@ from semantic_mapper.fields.kinds import FieldKind, field_kinds
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 
-NEURAY = FieldKind(NeuRayConfig, "research.peers.neuray", "NeuRay")
 SEMANTIC_NERF = FieldKind(SemanticNeRFConfig, "research.peers.semantic_nerf", "SemanticNeRF")
 PANOPTIC_UNIFORM = FieldKind(PanopticConfig, "research.peers.uniform_panoptic", "UniformPanoptic")
 

@@ -16,16 +16,24 @@ from torch import nn
 from torch.nn import functional
 
 from research.peers.config import SemanticNeRFConfig
-from research.peers.rendering import composite_render, density_from
 from research.peers.seen_bounds import seen_bounds
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.scene.grid import encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.views import EncodedViews, check_views, encoded_views
-from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
+from semantic_mapper.fields.volume import (
+    composite,
+    composite_depth,
+    compositing_weights,
+    field_render,
+    interval_lengths,
+)
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+
+DENSITY_START = 2.0  # log density of an untrained network: 7 / m, a third of the light gone after 5 cm
+DENSITY_LIMIT = 8.0  # 3,000 / m: opaque within 1 mm, and no overflow
 
 
 class SemanticNeRF(LearnedField):
@@ -83,7 +91,10 @@ class SemanticNeRF(LearnedField):
         known = inside.any(1) & ((self.fitted_steps > 0) | self.training)
         position = encode_frequencies(x.clamp(-1, 1), self.config.position_frequencies)
         trunk = self.upper(torch.cat((self.lower(position), position), dim=-1))
-        sigma = density_from(self.sigma(trunk)[..., 0]) * (inside & known[:, None])
+        # An exponential where NeRF has a ReLU: scenes are in metres here, and samples may stand a centimetre apart, so
+        # densities from 0.1 / m to 1,000 / m have to be in reach of one learning rate.
+        density = torch.exp((self.sigma(trunk)[..., 0] + DENSITY_START).clamp(max=DENSITY_LIMIT))
+        sigma = density * (inside & known[:, None])
         weights = compositing_weights(sigma, interval_lengths(z, rays.direction.norm(dim=-1)))
         towards = encode_frequencies(functional.normalize(rays.direction, dim=-1), self.config.direction_frequencies)
         towards = towards[:, None].expand(-1, z.shape[1], -1)
@@ -91,7 +102,8 @@ class SemanticNeRF(LearnedField):
         # The last layer of the head is linear, so it is applied once a ray: the same logits as a sample at a time.
         rendered = composite(weights, self.semantic(trunk))
         logits = functional.linear(rendered, self.classifier.weight) + weights.sum(1)[:, None] * self.classifier.bias
-        return composite_render(weights, z, colour, logits, known), weights
+        depth, rgb = composite_depth(weights, z), composite(weights, colour)
+        return field_render(logits=logits, depth_m=depth, opacity=weights.sum(dim=1), rgb=rgb, known=known), weights
 
 
 def config_for_scene(

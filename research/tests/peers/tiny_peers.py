@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from research.peers.config import NeuRayConfig, SemanticNeRFConfig
+from research.peers.config import SemanticNeRFConfig
 from semantic_mapper.config import Config
 from semantic_mapper.fields.learned import LearnedField
-from tests.fields.tiny_fields import COLOURS_ONLY, TINY, tiny
+from tests.fields.tiny_fields import TINY, tiny
 
 PEERS: dict[str, Config] = {
-    "neuray": NeuRayConfig(feature_dim=16, encoder=COLOURS_ONLY),
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
     "panoptic_uniform": TINY["panoptic"],
 }
