@@ -6,7 +6,8 @@ python -m research.experiments.kept_votes DIR val test kitchen=LOG flat=LOG [--s
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -153,31 +154,44 @@ def keep(path: Path, frames: Iterable[PosedFrame], labels: LabelSet, table: str,
     np.savez(path, allow_pickle=False, **arrays, stream_ignore=np.array(labels.ignore_id))
 
 
-_ARRAYS = ("rgb", "depth", "label", "pose", "intrinsics", "known", "rendered", "single", "own", "asked")
+_IMAGES = ("rgb", "depth", "label", "pose", "intrinsics")
+_SAID = ("known", "rendered", "single", "own", "asked")
+_ARRAYS = (*_IMAGES, *_SAID)
 
 
-def load(path: Path) -> Recording:
-    """What ``keep`` wrote."""
+def frames_of(path: Path, target: LabelSet, every: int = 1) -> list[PosedFrame]:
+    """Frames of a file of ``keep`` with ids of ``target``, without what was said of them."""
     with np.load(path) as file:
-        values = {name: file[name] for name in file.files}
-    names, ids = [str(n) for n in values["stream_names"]], [int(i) for i in values["stream_ids"]]
-    stream = make_label_set(path.stem, names, ids=ids, ignore_id=int(values["stream_ignore"]))
+        to_map, images = TruthMapper(_stream(path, file), target), (file[name][::every] for name in _IMAGES)
+        return [
+            PosedFrame(i, i, "camera", rgb, depth, to_map.to_map_ids(label, path.stem), _intrinsics(k), pose)
+            for i, (rgb, depth, label, pose, k) in enumerate(zip(*images, strict=True))
+        ]
+
+
+def _stream(path: Path, file: Mapping[str, NDArray[Any]]) -> LabelSet:
+    names, ids = [str(n) for n in file["stream_names"]], [int(i) for i in file["stream_ids"]]
+    return make_label_set(path.stem, names, ids=ids, ignore_id=int(file["stream_ignore"]))
+
+
+def _intrinsics(k: NDArray[Any]) -> CameraIntrinsics:
+    return CameraIntrinsics(*map(float, k[:4]), width=int(k[4]), height=int(k[5]))
+
+
+def load(path: Path, every: int = 1) -> Recording:
+    """What ``keep`` wrote, of every so many-th frame."""
     target = load_weights(default_checkpoint_path()).label_set
-    to_map = TruthMapper(stream, target)
-    surface, frames = SurfaceTruth(stream), list[Kept]()
-    for i, (rgb, depth, label, pose, k) in enumerate(zip(*(values[n] for n in _ARRAYS[:5]), strict=True)):
-        intrinsics = CameraIntrinsics(*map(float, k[:4]), width=int(k[4]), height=int(k[5]))
-        frame = PosedFrame(i, i, "camera", rgb, depth, label, intrinsics, pose)
-        surface.add(frame)
-        frame = PosedFrame(i, i, "camera", rgb, depth, to_map.to_map_ids(label, path.stem), intrinsics, pose)
-        said = (values[n][i].astype(np.float32) for n in _ARRAYS[6:])
-        frames.append(Kept(frame, label != stream.ignore_id, values["known"][i], *said))
+    with np.load(path) as file:
+        stream = _stream(path, file)
+        labels, *said = (file[name][::every] for name in ("label", *_SAID))
+        points = (file["xyz"], file["surface"]) if "xyz" in file else None
+    to_map, surface, frames = TruthMapper(stream, target), SurfaceTruth(stream), list[Kept]()
+    for frame, label, known, *of in zip(frames_of(path, target, every), labels, *said, strict=True):
+        surface.add(replace(frame, label=label))
+        frames.append(Kept(frame, label != stream.ignore_id, known, *(p.astype(np.float32) for p in of)))
 
     def truth(xyz: Float32) -> tuple[UInt8, Bool]:
-        if "xyz" in values:
-            labels = nearest_labels(xyz, values["xyz"], values["surface"], stream, max_distance_m=NEAR_M)
-        else:
-            labels = surface.labels_at(xyz)
+        labels = nearest_labels(xyz, *points, stream, max_distance_m=NEAR_M) if points else surface.labels_at(xyz)
         return to_map.to_map_ids(labels, path.stem), labels != stream.ignore_id
 
     return Recording(path.stem, target, frames, truth)
