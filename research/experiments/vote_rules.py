@@ -36,21 +36,21 @@ def votes(
             w[where(kept, voxel_map)] = there
         floor = np.log(np.float32(PROBABILITY_FLOOR))
         log_p = (1 - w)[..., None] * np.log(np.maximum(getattr(kept, of), PROBABILITY_FLOOR))
-        log_p += w[..., None] * np.maximum(_log(kept), floor)
+        log_p += w[..., None] * np.maximum(log_own(kept), floor)
         p = np.exp(log_p - log_p.max(axis=2, keepdims=True))
         return (p / p.sum(axis=2, keepdims=True)).astype(np.float32)
 
     return rule
 
 
-def _log(kept: Kept) -> Float32:
+def log_own(kept: Kept) -> Float32:
     """(h, w, L) log probabilities of the own image."""
     x = kept.own - kept.own.max(axis=2, keepdims=True)
     return x - np.log(np.exp(x).sum(axis=2, keepdims=True))
 
 
 def _flat(below: float) -> Where:
-    return lambda kept, _: _log(kept).max(axis=2) < np.log(below)
+    return lambda kept, _: log_own(kept).max(axis=2) < np.log(below)
 
 
 def _unsure(below: float) -> Where:
@@ -60,12 +60,8 @@ def _unsure(below: float) -> Where:
     )
 
 
-def _depth(least: float, most: float) -> Where:
-    def at(kept: Kept, _: VoxelMap) -> Bool:
-        depth = FrameViews(kept.frame).depth(kept.coarse)
-        return (depth > least) & (depth < most)
-
-    return at
+def _beyond(least: float) -> Where:
+    return lambda kept, _: FrameViews(kept.frame).depth(kept.coarse) > least
 
 
 RULES = {
@@ -73,12 +69,8 @@ RULES = {
     "own image + votes of the suite (0.2 of its own rendering)": votes(0.2, of="single"),
     **{f"S-Ray, weight {w}": votes(w) for w in (0.2, 0.5, 0.8, 0.9)},
     "1; 0.2 where the own image is flat (< 0.4)": votes(1, _flat(0.4)),
-    "1; 0.2 where the own image is flat (< 0.6)": votes(1, _flat(0.6)),
-    "1; 0.2 where the map has no vote yet": votes(1, _unsure(0.01)),
-    "1; 0.2 where the map is unsure (< 0.8)": votes(1, _unsure(0.8)),
-    "1; 0.2 where S-Ray is sure (> 0.8)": votes(1, lambda kept, _: kept.rendered.max(axis=2) > 0.8),
-    "1; 0.5 beyond 3 m": votes(1, _depth(3, np.inf), 0.5),
-    "1; 0.5 within 1.2 m": votes(1, _depth(0, 1.2), 0.5),
+    "1; 0.2 where the map is unsure (< 0.5)": votes(1, _unsure(0.5)),
+    "1; 0.5 beyond 3 m": votes(1, _beyond(3), 0.5),
 }
 
 
