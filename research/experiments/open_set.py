@@ -48,7 +48,7 @@ SHRINKAGE = 0.01  # of the covariance to a multiple of the identity
 TURNS_DEG, PITCH_DEG, VIEW_DEG = range(0, 360, 45), 8.0, 75.0  # of views into a panorama
 COVERAGE = "kept; right of these; right of the others; lacking kept; well answered"  # of thresholds
 THRESHOLDS = (0.0, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7)
-TEMPERATURES, OWN_WEIGHT = (1.0, 1.1, 1.2, 1.3, 1.5), 0.8  # of votes; of the own image in them, as the mapper has it
+TEMPERATURES, OWN_WEIGHT = (1.1, 1.2, 1.3, 1.5), 0.8  # of votes, besides 1; of the own image in them
 SPLITS, MOST_ROOMS, SHORTEST_HALF = ("val", "test"), 6, 20  # frames, of recordings that are cut in two by time
 
 
@@ -220,29 +220,29 @@ def _show_kept(sources: Sequence[str], plot: Path | None) -> None:
         photographs = np.concatenate([v for name, v in values.items() if name not in SPLITS])
         auroc, cells = (photographs[:, None] > rooms).mean(), [f"{np.median(v):.2f}" for v in values.values()]
         print(f"| {title} ({auroc:.3f}) | {' | '.join(cells)} |")
-    limit = float(np.percentile(entropy[SPLITS[0]], 95))
-    rules: dict[str, Callable[[Kept], float]] = {f"{t:g}": lambda _, t=t: t for t in TEMPERATURES}
-    rules[f"1.2 of frames of an entropy above {limit:.2f}"] = lambda kept: 1.2 if _entropy(kept) > limit else 1.0
-    print(f"\n| temperature: ECE of frames; of points, % | {tail}")
-    plain: dict[str, tuple[UInt8, UInt8, Float32]] = {}  # points by the first rule
-    for rule, of in rules.items():
-        cells: list[str] = []
-        for name, recordings in parts.items():
-            truth, label, confidence, ece = _voted(recordings, of)
-            sure, _ = ConfidenceScores(), plain.setdefault(name, (truth, label, confidence))
-            sure.update(confidence, label == truth, truth == ignore)
-            cells.append(f"{100 * ece:.1f}; {100 * (sure.calibration_error or 0):.1f}")
-        print(f"| {rule} | {' | '.join(cells)} |", flush=True)
+    maps = {name: _voted(of, lambda _: 1.0) for name, of in parts.items()}
     print(f"\n| unknown below: {COVERAGE}, % | {tail}")
     for least in THRESHOLDS:
-        cells = ["; ".join(f"{x:.1f}" for x in _coverage(*found, ignore, least)) for found in plain.values()]
-        print(f"| {least:g} | {' | '.join(cells)} |")
+        cells = ["; ".join(f"{x:.1f}" for x in _coverage(*of[:3], ignore, least)) for of in maps.values()]
+        print(f"| {least:g} | {' | '.join(cells)} |", flush=True)
     if plot:
-        curves = {n: [_coverage(*found, ignore, t) for t in np.linspace(0.95, 0, 96)] for n, found in plain.items()}
+        curves = {n: [_coverage(*of[:3], ignore, t) for t in np.linspace(0.95, 0, 96)] for n, of in maps.items()}
         right = [Curve(name, [(x[0], x[1]) for x in curve]) for name, curve in curves.items()]
         lacking = [Curve(n, [(x[0], x[3]) for x in c]) for n, c in curves.items() if np.isfinite(c[0][3])]
         titles = {"right of these, %": right, "kept of classes that the map lacks, %": lacking}
         write_picture(plot, draw_panels("", [Panel("", y, "kept, %", of) for y, of in titles.items()]))
+    limit = float(np.percentile(entropy[SPLITS[0]], 95))
+    rules: dict[str, Callable[[Kept], float]] = {f"{t:g}": lambda _, t=t: t for t in TEMPERATURES}
+    rules[f"1.2 of frames of an entropy above {limit:.2f}"] = lambda kept: 1.2 if _entropy(kept) > limit else 1.0
+    print(f"\n| temperature: ECE of frames; of points, % | {tail}")
+    for rule in ("1", *rules):
+        maps = {name: _voted(of, rules[rule]) for name, of in parts.items()} if rule in rules else maps
+        cells: list[str] = []
+        for truth, label, confidence, ece in maps.values():
+            sure = ConfidenceScores()
+            sure.update(confidence, label == truth, truth == ignore)
+            cells.append(f"{100 * ece:.1f}; {100 * (sure.calibration_error or 0):.1f}")
+        print(f"| {rule} | {' | '.join(cells)} |", flush=True)
 
 
 def main() -> None:
