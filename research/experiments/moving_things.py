@@ -5,7 +5,7 @@ same. A log is mapped as it is and with a cylinder of the size of a person that 
 Each is mapped with ``moving`` off, on (``motion``, ``classes``, ``both``), and as by a mapper that knows the ``truth``.
 The field knows the true class of each pixel of the frame, "person" too; with ``--weights`` it is S-Ray.
 
-Example: python -m research.experiments.moving_things rooms --modes off motion truth --picture moving.png
+Example: python -m research.experiments.moving_things rooms --modes off motion truth
          python -m research.experiments.moving_things kitchen.mcap
 """
 
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -31,15 +30,13 @@ from research.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, RoomConfi
 from research.scenes.moving import make_moving_room, moving_views
 from research.scenes.primitives import PERSON
 from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
-from semantic_mapper.evaluation.upright import camera_up, upright_rotation
+from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.fields.base import CHUNK, Rays, Rendered, WorkingView
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.replay.overview import draw_points, from_above
 from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 FIRST = 15  # frames before answers count: the map has to see free space first
@@ -57,7 +54,6 @@ MODES = {
     "both": (True, True),
     "truth": (False, False),
 }
-RED, BLUE = np.array((230, 40, 40)), np.array((40, 90, 230))
 
 
 class Seen(NamedTuple):
@@ -167,7 +163,6 @@ class Run:
         self.on_still = 0  # false pixels on what never moves
         self.seen_free = np.zeros(2, int)  # of moving pixels, every third: those seen free before, of these found
         self.found = np.zeros((len(stretch.things) + 1, 2), int)  # of each thing: moving pixels, of these found
-        self.shown: tuple[int, Seen, Bool] | None = None  # the frame with most pixels that move
 
     def step(self, seen: Seen, number: int, free_before: Bool) -> None:
         """Map a frame and count; ``free_before`` from ``was_free``."""
@@ -196,8 +191,6 @@ class Run:
         self.seen_free += (free.sum(), (free & answer[::STRIDE, ::STRIDE]).sum())
         for column, pixels in enumerate((truth, truth & answer)):
             self.found[:, column] += np.bincount(seen.thing[pixels], minlength=len(self.found))
-        if self.shown is None or truth.sum() > self.shown[0]:
-            self.shown = int(truth.sum()), seen, answer
 
     def xyz(self) -> Float64:
         """(N, 3) surface points of the map."""
@@ -245,10 +238,8 @@ class Surface:
         return KDTree(np.array(list(self._cells.values()))).query(xyz)[0]
 
 
-def map_stretch(
-    stretch: Stretch, modes: Sequence[str], weights: Path | None = None
-) -> tuple[dict[str, dict[str, Any]], dict[str, Run], Surface]:
-    """Figures by mode, the runs with things that move, and the surfaces that stay."""
+def map_stretch(stretch: Stretch, modes: Sequence[str], weights: Path | None = None) -> dict[str, dict[str, Any]]:
+    """Figures by mode."""
     runs, bare = ({mode: Run(mode, stretch, weights) for mode in modes} for _ in range(2))
     things, static = [Surface() for _ in stretch.things], Surface()
     before: deque[Seen] = deque(maxlen=BEFORE // EVERY)
@@ -287,7 +278,7 @@ def map_stretch(
             "lost_beside_things": _lost(kept, xyz, 2 * reach),
             "cpu_ms": 1e3 * float(np.mean(run.cpu_s[FIRST:])), "cpu_ratio": float(np.sum(run.cpu_s[FIRST:])) / off_s,
         }  # fmt: skip
-    return figures, runs, static
+    return figures
 
 
 def _lost(kept: Float64, xyz: Float64, reach: float) -> int:
@@ -408,35 +399,6 @@ def _hidden(frames: Sequence[PosedFrame], person: Thing) -> float:
     return float(np.mean([a.depth_m != b.depth_m for a, b in zip(there, some, strict=True)]))
 
 
-def draw(path: Path, runs: dict[str, Run], static: Surface) -> None:
-    """A frame, what moves in it, the answer; below, the maps from above, with ghosts in red."""
-    answering = next(runs[mode] for mode in ("motion", "both", "classes", "truth", "off") if mode in runs)
-    assert answering.shown is not None
-    _, seen, answer = answering.shown
-    row = [seen.frame.rgb, _tinted(seen.frame.rgb, seen.moving, BLUE), _tinted(seen.frame.rgb, answer, RED)]
-    h, w = seen.thing.shape
-    maps: list[UInt8] = []
-    camera = turn = None
-    for run in (runs["off"], answering):
-        points = run.pipeline.voxel_map.points()
-        xyz = points.xyz.astype(np.float64)
-        rgb = np.where((static.distance(xyz) > APART_M)[:, None], RED, points.rgb).astype(np.uint8)
-        if turn is None:
-            turn = upright_rotation(xyz, camera_up(seen.frame.T_world_camera[None]))
-        view = xyz @ turn.T
-        low = view[:, 2] < np.percentile(view[:, 2], 0.5) + 1.9  # without the ceiling
-        view, size = from_above(view[low]), (3 * w // 2, h * 3 // 2)
-        if camera is None:
-            least, most = np.percentile(view[:, :2], (1, 99), axis=0)
-            camera = ((least + most) / 2, float((np.array(size) / (most - least + 0.2)).min()))
-        maps.append(draw_points(view, rgb[low], size, (255, 255, 255), camera=camera)[0])
-    write_picture(path, np.concatenate((np.concatenate(row, axis=1), np.concatenate(maps, axis=1))))
-
-
-def _tinted(rgb: UInt8, pixels: NDArray[np.bool_], color: NDArray[np.int_]) -> UInt8:
-    return np.where(pixels[..., None], rgb * 0.35 + color * 0.65, rgb).astype(np.uint8)
-
-
 def main() -> None:
     """Print the figures of each room or stretch of a log, and of all together, as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -450,7 +412,6 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="S-Ray with these weights tells the classes")
     parser.add_argument("--pose-noise", nargs=2, type=float, metavar=("CM", "DEG"), help="of each frame by itself")
     parser.add_argument("--slow", action="store_true", help="pose noise that drifts")
-    parser.add_argument("--picture", type=Path, help="PNG of the first room")
     given = parser.parse_args()
     if "off" not in given.modes:
         parser.error("--modes: all others are compared with off")
@@ -469,11 +430,8 @@ def main() -> None:
     for stretch in stretches:
         if given.pose_noise:
             stretch = with_wrong_poses(stretch, *given.pose_noise, slow=given.slow)
-        figures, runs, static = map_stretch(stretch, given.modes, given.weights)
-        if given.picture and not result:
-            draw(given.picture, runs, static)
-        result.append(figures)
-        print(stretch.name, json.dumps(total([figures])), flush=True)
+        result.append(map_stretch(stretch, given.modes, given.weights))
+        print(stretch.name, json.dumps(total(result[-1:])), flush=True)
     print(json.dumps(total(result), indent=1))
 
 
