@@ -30,6 +30,7 @@ from semantic_mapper.types import PosedFrame
 ROOMS, PHOTOGRAPHS = "val", "kitchen"  # sources that things are taken from for the others
 OF_ROOM, OF_RECORDING = 5, 32  # frames, about, where there are so many
 Array = NDArray[Any]
+Frames = Sequence[PosedFrame]
 
 
 class Picture(NamedTuple):
@@ -100,9 +101,7 @@ Change = Callable[[Picture, Other], Picture]
 IN_BOTH: dict[str, Change] = {
     "smooth, by a bilateral filter": lambda p, _: p._replace(rgb=_smooth(p.rgb)),
     "white balance of the others": lambda p, o: p._replace(rgb=p.rgb * o.gains / _gains(p.rgb)),
-    "light: mean and contrast of the others": lambda p, o: p._replace(
-        rgb=(p.rgb - p.rgb.mean()) / p.rgb.std() * o.light[1] + o.light[0]
-    ),
+    "light of the others": lambda p, o: p._replace(rgb=(p.rgb - p.rgb.mean()) / p.rgb.std() * o.light[1] + o.light[0]),
     "grey": lambda p, _: p._replace(rgb=p.rgb.mean(2, keepdims=True).repeat(3, 2)),
     "no depth": lambda p, _: p._replace(depth=0 * p.depth),
     "depth alone": lambda p, _: p._replace(rgb=np.full_like(p.rgb, 128)),
@@ -131,11 +130,7 @@ OF_RECORDINGS: dict[str, Change] = {
 
 
 def score(
-    groups: Sequence[Sequence[PosedFrame]],
-    change: Change,
-    others: Sequence[PosedFrame],
-    ask: Predictor,
-    labels: LabelSet,
+    groups: Sequence[Frames], change: Change, others: Frames, ask: Predictor, labels: LabelSet
 ) -> list[ConfusionMatrix]:
     """Of each group of frames, with a change; draws are the same for all changes."""
     rng, found = np.random.default_rng(0), list[ConfusionMatrix]()
