@@ -63,12 +63,17 @@ def test_too_little_of_a_board_wrong_intrinsics_and_small_boards_give_no_pose() 
         (CHARUCO, as_seen(np.full((480, 640, 3), 200, np.uint8)), "no_board", "0 corners"),
         (CHARUCO, as_seen(covered), "no_board", "corners of it are seen"),
         (CHARUCO, as_seen(seen.rgb, wrong), "inexact", "check its sizes"),
-        (tiny, view(tiny, (0.0, 0.02, -0.9))[1], "uncertain", "show it larger"),
+        (
+            tiny,
+            view(tiny, (0.0, 0.02, -0.9))[1],
+            "uncertain ambiguous",
+            "show it larger",
+        ),  # either, by OpenCV's version
         (tiny, view(tiny, (0.08, 0.06, -0.8))[1], "ambiguous", "mirrored"),
     ):
         source = BoardPoseSource(config)
         assert source.pose(image) is None
-        assert source.counters == {reason: 1} and says in source.warnings[0]
+        assert source.counters.total() == 1 and {*source.counters} <= {*reason.split()} and says in source.warnings[0]
     source = BoardPoseSource(CHARUCO)
     assert source.pose(as_seen(covered)) is None and source.pose(seen) is not None and source.warnings == ()
 
