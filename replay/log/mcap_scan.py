@@ -4,6 +4,7 @@ An index whose checksum is right names every chunk, whatever is damaged before i
 first record whose head is damaged. Each chunk's own checksum tells whether its messages can be believed.
 """
 
+import contextlib
 import io
 import os
 import struct
@@ -25,6 +26,7 @@ from semantic_mapper.errors import LogError
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, start of its offsets, crc of the summary
+_CHUNK_TIMES = struct.Struct("<BQQQ")  # opcode, length, first and last time
 _PLAIN_CHUNK_BYTES = 40  # before the records of a chunk that is not compressed
 _NAME_AT = 37  # length of the compression's name in a chunk
 _MESSAGE_BYTES = 22  # channel, sequence and two times, before a message's data
@@ -113,6 +115,15 @@ def _walk(fd: int, size: int) -> Scan:
         elif opcode == Opcode.ATTACHMENT:
             attachments.append(place)
     return Scan(chunks, attachments, finished=False)
+
+
+def last_time_ns(fd: int, place: Place) -> int:
+    """Latest time of the messages of a chunk, as its head says; of anything else one that no message has."""
+    with contextlib.suppress(OSError, struct.error):  # whoever reads it meets that again
+        opcode, _, _, last = _CHUNK_TIMES.unpack(os.pread(fd, _CHUNK_TIMES.size, place.offset))
+        if opcode == Opcode.CHUNK:
+            return last
+    return 1 << 64
 
 
 def read_payloads(fd: int, place: Place, most: int | None = None) -> list[bytes]:

@@ -146,8 +146,9 @@ def _looped(log: Log, from_stamp_ns: int) -> Iterator[tuple[Envelope, list[bytes
 def _due_frames(log: Log, options: PlayOptions, stop: threading.Event) -> Iterator[tuple[Envelope, list[bytes]]]:
     """Frames when they are to be sent, until ``stop``."""
     began: tuple[float, int] | None = None  # clock and stamp at the first frame
-    for envelope, parts in _looped(log, options.from_stamp_ns) if options.loop else log.frame_parts():
-        if envelope.stamp_ns < options.from_stamp_ns:
+    start_ns = options.from_stamp_ns
+    for envelope, parts in _looped(log, start_ns) if options.loop else log.frame_parts(start_ns):
+        if envelope.stamp_ns < start_ns:
             continue
         if options.mode == "realtime":  # keep the distances in time of the recording
             began = began or (time.monotonic(), envelope.stamp_ns)

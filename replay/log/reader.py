@@ -1,6 +1,6 @@
 """Reading a log: what is damaged is reported and passed over, the rest is given."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import islice, pairwise
@@ -12,7 +12,7 @@ import msgspec
 from semantic_mapper.config import nearest_path
 from semantic_mapper.errors import CodecError, ConfigError, EmptyMapError, LogError
 from semantic_mapper.files import open_regular
-from semantic_mapper.replay.log.mcap_scan import Place, Scan, read_attachment, read_payloads, scan
+from semantic_mapper.replay.log.mcap_scan import Place, Scan, last_time_ns, read_attachment, read_payloads, scan
 from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope, unpack_parts
 from semantic_mapper.transport.messages import StreamInfo, parse_topic
 from semantic_mapper.types import PosedFrame
@@ -143,9 +143,10 @@ class LogReader:
             raise LogError(f"{self.path}: no frame {number}; the log holds {len(self)}")
         return self._decoded(self._frames[number], partial(decode_as, PosedFrame))
 
-    def frame_parts(self) -> Iterator[tuple[Envelope, list[bytes]]]:
-        """Frames as they travel: what is known without decoding images (pose included), and the wire bytes."""
-        return self._parts(self._frames)
+    def frame_parts(self, from_stamp_ns: int = 0) -> Iterator[tuple[Envelope, list[bytes]]]:
+        """Frames as they travel: what is known without decoding images (pose included), and the wire bytes. Chunks
+        that end before ``from_stamp_ns`` are not read."""
+        return self._parts(e for e in self._frames if last_time_ns(e.file.fd, e.chunk) >= from_stamp_ns)
 
     def messages(self) -> Iterator[tuple[Envelope, list[bytes]]]:
         """Messages of all topics as they travel; each part begins with its stream information."""
@@ -239,7 +240,7 @@ class LogReader:
             return infos[0]
         return msgspec.structs.replace(infos[0], source=" + ".join(sources), cameras=cameras, frame_count=None)
 
-    def _parts(self, entries: list[_Entry]) -> Iterator[tuple[Envelope, list[bytes]]]:
+    def _parts(self, entries: Iterable[_Entry]) -> Iterator[tuple[Envelope, list[bytes]]]:
         for entry in entries:
             try:
                 yield self._decoded(entry, lambda parts: (read_envelope(parts), parts))

@@ -142,6 +142,18 @@ def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: s
     assert isinstance(end, EndOfStream) and end.unreadable == 1 and "seq=1" in end.damages[0]
 
 
+def test_what_ends_before_the_start_is_not_read(small_log: Path, endpoint: str) -> None:
+    data = bytearray(small_log.read_bytes())
+    with LogReader(small_log) as reader:
+        at = reader._frames[1].chunk.offset + 1000
+    data[at] ^= 1  # only whoever reads the frame meets it
+    small_log.write_bytes(data)
+    for start, seqs in ((0, [0, *range(2, FRAMES)]), (3, [*range(3, FRAMES)])):
+        options = PlayOptions(from_stamp_ns=samples.make_frame(start).stamp_ns)
+        report, mapper = play_to(small_log, endpoint, fuse, options=options)
+        assert mapper.seqs == seqs and len(report.errors) == (start == 0)
+
+
 @pytest.mark.parametrize(
     "options",
     [
