@@ -1,20 +1,27 @@
 """A long recording at the price of a short one: the frames of a room seen on a walk to and fro, with new stamps.
 
-As a program, one of many gigabytes in few frames, for what opens, cuts and recovers logs:
-python -m research.experiments.long_log big.mcap --gb 50
+As a program, one of many gigabytes in few frames, and what it takes to read it, to begin near its end, and to recover
+it with its end cut off, which is done to the file itself; each in a process of its own:
+python -m research.experiments.long_log big.mcap --gb 15
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import multiprocessing
+import os
+import re
+import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from research.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.nodes.cli.info import describe_log
+from semantic_mapper.replay.log.format import LogReader, LogWriter, recover
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import depth_from_uint16, encode_rgb
 from semantic_mapper.transport.messages import StreamInfo
@@ -70,9 +77,34 @@ def write_big_log(path: Path, size_gb: float) -> Path:
     return path
 
 
+STEPS = {
+    "info": lambda path: describe_log([path], lambda: None)["frames"],
+    "open, first of the last ten frames": lambda path: (
+        next((log := LogReader(path)).frame_parts(log.frame(len(log) - 10).stamp_ns))[0].seq
+    ),
+    "info, end cut off": lambda path: describe_log([path], lambda: None)["frames"],
+    "recover, end cut off": lambda path: recover(path, path.with_stem(path.stem + "-recovered")).frames,
+}
+
+
+def measure(step: str, path: Path) -> None:
+    """Do it, and print a row."""
+    began, worked = time.perf_counter(), time.process_time()
+    given = STEPS[step](path)
+    spent = time.perf_counter() - began, time.process_time() - worked
+    peak_kb = re.findall(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())[0]
+    print(f"| {step} | {given:,} | {spent[0]:.1f} | {spent[1]:.1f} | {int(peak_kb) / 1000:,.0f} |", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
     parser.add_argument("--gb", type=float, default=50.0)
     options = parser.parse_args()
     write_big_log(options.log, options.gb)
+    print("| step | frames, or number of the frame | seconds | CPU s | largest memory, MB |\n|---|---|---|---|---|")
+    for number, name in enumerate(STEPS):
+        if number == 2:
+            os.truncate(options.log, options.log.stat().st_size - 20_000_000)
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            pool.submit(measure, name, options.log).result()
