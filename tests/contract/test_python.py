@@ -68,7 +68,8 @@ def _arguments(value: Any) -> list[list[str]]:
         parameters = inspect.signature(value).parameters.values()
     except (TypeError, ValueError):
         return []
-    return [[p.name, "given" if p.default is p.empty else "left out"] for p in parameters if p.name[0] != "_"]
+    named = [p for p in parameters if p.name[0] != "_" and p.kind is not p.POSITIONAL_ONLY]  # 3.13 tells of such
+    return [[p.name, "given" if p.default is p.empty else "left out"] for p in named]
 
 
 _GOLDEN: dict[str, dict[str, list[list[str]]]] = read("python")
