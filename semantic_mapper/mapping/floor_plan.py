@@ -215,7 +215,7 @@ def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, ...]:
     files = _write_grid(path, grid, grey, "trinary")
     if grid.costs is None:
         return files
-    grey = np.where(grid.costs < 0, _UNKNOWN_RAW, grid.costs).astype(np.uint8)
+    grey = np.where(grid.costs < 0, _UNKNOWN_RAW, grid.costs.astype(np.uint8))
     return files + _write_grid(path.with_stem(f"{path.stem}_costs"), grid, grey, "raw")
 
 
