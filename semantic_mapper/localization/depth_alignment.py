@@ -24,6 +24,7 @@ FALSE = 0.01  # of the information about the best known direction: noise of norm
 _FLAT_TURN = 0.015  # the same for turns
 _STILL_M, _STILL_RAD = 2e-5, 2e-5  # smaller steps end a level
 _DAMPING = 1e-4  # of the normal matrix's mean diagonal: directions of which no point says anything stay as they are
+_LEAST_DAMPING = 1e-9  # where nothing says anything: then the camera stays
 _LEAST_POINTS = 30
 _COARSER = 2.0  # noise at each level, by that of the next finer one
 _SMOOTH_PX = 7  # width of the filter that takes the sensor's noise off points and normals
@@ -132,7 +133,7 @@ def align(levels: Sequence[Level], targets: Sequence[Target], T_world_camera: Fl
 
 def gauss_newton_step(normal_matrix: Float64, gradient: Float64) -> Float64:
     """Motion of the camera in its own axes, (4, 4) to be multiplied from the right, that lowers the cost the most."""
-    damping = _DAMPING * np.trace(normal_matrix) / 6 * np.eye(6)
+    damping = max(_DAMPING * np.trace(normal_matrix) / 6, _LEAST_DAMPING) * np.eye(6)
     change = -np.linalg.solve(normal_matrix + damping, gradient)
     return make_pose(change[:3], change[3:])
 

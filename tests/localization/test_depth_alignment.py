@@ -7,6 +7,7 @@ from semantic_mapper.localization.depth_alignment import (
     align,
     fit,
     flat_directions,
+    gauss_newton_step,
     make_levels,
     thin_depth,
     thin_intrinsics,
@@ -43,6 +44,10 @@ def test_a_wall_leaves_two_shifts_and_a_turn_open_and_a_corner_none() -> None:
     assert np.allclose(flat[0], np.diag((0, 0, 1)), atol=1e-3) and np.allclose(flat[1], np.diag((1, 1, 0)), atol=1e-3)
     room = levels_of(walk_frames(7, 1, INTRINSICS)[0])
     assert flat_directions([fit(room, Target(room, np.eye(4)), np.eye(4)).normal_matrix]) is None
+
+
+def test_a_camera_of_which_nothing_says_anything_stays() -> None:
+    np.testing.assert_array_equal(gauss_newton_step(np.zeros((6, 6)), np.zeros(6)), np.eye(4))
 
 
 def test_points_and_rays_of_thinned_images_are_those_of_the_whole() -> None:
