@@ -2,42 +2,57 @@
 
     python -m research.experiments.days --split test
     python -m research.experiments.days --split test --own    # labels of S-Ray instead of the true ones
-    python -m research.experiments.days --split test --goes-on  # one map of both visits instead of two maps
 
-Homes of ``scenes.days``. Poses of the second visit are off by 2 cm and 0.5 degrees in each room. A change counts where
-it could be seen: the thing in ``LEAST_FRAMES`` frames of ``LEAST_PIXELS`` or more, and through its place in as many of
-the other visit. What is reported at a place of one that does not count is left out. Right is a report of the same kind
-with its places at the true ones.
+Homes of ``scenes.days``, each visited three times: on the second visit only the light has changed. Each visit makes a
+map of its own. Poses of the later ones are off by 2 cm and 0.5 degrees in each room. A change counts where it could be
+seen: the thing in ``LEAST_FRAMES`` frames of ``LEAST_PIXELS`` or more, and through its place in as many of the other
+visit. What is reported at a place of one that does not count is left out. Right is a report of the same kind with its
+places at the true ones. Identity: what stood, or was moved, has the id at the end that it had in the first map, after
+that was saved and merged with the second, and the third compared with both.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from research.experiments.put_things import map_frame, sees_through
+from research.experiments.relocalization import WITHIN_DEG, WITHIN_M
 from research.scenes.config import NoiseConfig
-from research.scenes.days import DayChange, make_home, next_day, pose_errors, visit
+from research.scenes.days import SHELL, TEMPLATES, DayChange, Home, make_home, next_day, pose_errors, visit
+from research.scenes.materials import Pattern
 from research.scenes.sequence import RoomView
 from research.suites.config import camera_of_width
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import unproject
-from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
+from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
+from semantic_mapper.localization.features import find_place_features
+from semantic_mapper.localization.places import MAX_FEATURES, make_place, view_distances
+from semantic_mapper.localization.relocalizer import (
+    Relocalized,
+    Relocalizer,
+    Sighting,
+    agreed,
+    find_consensus,
+    sighting,
+)
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.odometry_sessions import REMEMBERED
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.fleet.merge import merge_maps
 from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
-from semantic_mapper.queries.objects import ObjectChange, ObjectMemory, changes_of
+from semantic_mapper.queries.objects import MapObject, ObjectChange, ObjectMemory, changes_between, changes_of, remember
 from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import Float64, PosedFrame
 
 SPLITS = {"tune": range(60_000, 60_006), "test": range(80_000, 80_020)}
 FRAMES = 160  # of a visit to a room
@@ -48,6 +63,8 @@ KINDS = ("moved", "new", "gone")
 VISIT_NS = 86_400_000_000_000
 FRAME_NS = 66_666_667
 PROBES = 60  # points in a thing's box
+HELD = 30  # frames that a robot that starts in a room holds, at most, until it knows where it is
+SPREAD, MANY = 0.12, {Pattern.SPINES, Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE}  # of one colour; of many
 
 
 class Truth(NamedTuple):
@@ -58,6 +75,16 @@ class Truth(NamedTuple):
     after: list[list[float]] | None
     label: int
     counts: bool
+
+
+class Thing(NamedTuple):
+    """A true thing; ``rgb`` is None where it has no one colour."""
+
+    name: str
+    room: str
+    low: list[float]
+    high: list[float]
+    rgb: list[float] | None
 
 
 class _Seen:
@@ -107,57 +134,90 @@ class _Seen:
 class Labelled:
     """A map of true labels, with views as a mapper keeps them."""
 
-    def __init__(self, voxel_map: VoxelMap | None, label_set: LabelSet = ROOMS) -> None:
-        self.voxel_map = VoxelMap(VoxelMapConfig(), label_set) if voxel_map is None else voxel_map
+    def __init__(self, label_set: LabelSet) -> None:
+        self.voxel_map = VoxelMap(VoxelMapConfig(), label_set)
 
     def add(self, frame: PosedFrame) -> None:
         """Fuse a frame."""
         map_frame(self.voxel_map, frame)
         if self.voxel_map.places.wants(frame.T_world_camera):
             assert frame.depth_m is not None
-            points = unproject(frame.depth_m, frame.intrinsics)[4::10, 4::10].reshape(-1, 3)
-            points = points[points[:, 2] > 0].astype(np.float32)
-            none = np.zeros((len(points), DESCRIPTOR_BYTES), np.uint8)
-            self.voxel_map.places.add(Place("rooms", frame.stamp_ns, frame.T_world_camera, points, none))
+            features = find_place_features(frame.rgb, frame.depth_m, MAX_FEATURES)
+            T, k = frame.T_world_camera, frame.intrinsics
+            self.voxel_map.places.add(make_place(frame.camera_id, frame.stamp_ns, T, features, k))
 
 
 class _Own:
     """A map of S-Ray's labels."""
 
-    def __init__(self, voxel_map: VoxelMap | None) -> None:
+    def __init__(self) -> None:
         self.pipeline = Mapper.load(default_checkpoint_path()).pipeline
         self.voxel_map = self.pipeline.voxel_map
-        if voxel_map is not None:
-            self.voxel_map.take_over(voxel_map)
 
     def add(self, frame: PosedFrame) -> None:
         self.pipeline.step(replace(frame, label=None))
 
 
-def map_days(seed: int, *, changes: bool, own: bool, apart: bool) -> tuple[MapVisit, MapVisit, list[Truth]]:
-    """Map both visits to a home; the second goes on in the first map, or is ``apart``."""
-    home = make_home(seed)
-    later, true = next_day(home, seed, changes=changes)
-    seen = _Seen(true)
-    errors = pose_errors(np.random.default_rng((78, seed)), len(home.rooms))
-    camera = camera_of_width(OWN_WIDTH if own else WIDTH)
-    visits, voxel_map = list[MapVisit](), None
-    for day, rooms in enumerate((home, later)):
-        mapper = (_Own if own else Labelled)(None if apart else voxel_map)
-        views = visit(rooms, seed + 31 * day, FRAMES, camera, NoiseConfig(), errors if day else ())
-        for number, (_, view) in enumerate(views):
-            seen.look(view, day)
-            stamp_ns = day * VISIT_NS + (number + 1) * FRAME_NS
-            mapper.add(replace(view.frame, stamp_ns=stamp_ns, seq=number))
-        voxel_map = mapper.voxel_map
-        visits.append(visit_of(voxel_map, day * VISIT_NS))
-    return visits[0], visits[1], seen.truths(true)
+def map_days(seed: int, own: bool, path: Path) -> None:
+    """Visit a home three times; write the maps, and what is true, last."""
+    home, rng = make_home(seed), np.random.default_rng((78, seed))
+    same, later, true = next_day(home, seed, changes=False)[0], *next_day(home, seed)
+    seen, counts = _Seen(true), np.zeros((2, len(home.rooms), 1 << 16), np.int64)
+    camera, heads, finder = camera_of_width(OWN_WIDTH if own else WIDTH), list[RoomView](), None
+    for day, rooms in enumerate((home, same, later)):
+        mapper, errors = _Own() if own else Labelled(ROOMS), pose_errors(rng, len(home.rooms)) if day else ()
+        for number, (room, view) in enumerate(visit(rooms, seed + 31 * day, FRAMES, camera, NoiseConfig(), errors)):
+            if day != 1:
+                seen.look(view, day // 2)
+                shown = np.bincount(view.rendered.instance.ravel(), minlength=1 << 16)
+                counts[day // 2, room] += shown >= LEAST_PIXELS
+            heads += [view] * (day == 2 and number % FRAMES < HELD)
+            mapper.add(replace(view.frame, stamp_ns=day * VISIT_NS + (number + 1) * FRAME_NS, seq=number))
+        mapper.voxel_map.save(path.with_suffix(f".{day}.npz"))
+        finder = finder or Relocalizer(mapper.voxel_map.places.places, mapper.voxel_map, ROOMS.ignore_id)
+    assert finder is not None
+    starts = [find_start(finder, heads[k : k + HELD]) for k in range(0, len(heads), HELD)]
+    was, now = (list(things_of(*pair)) for pair in zip((home, later), counts, strict=True))
+    stood = [(ROOMS.id_of(t.name), t.low, t.high) for t in was if t in now]
+    path.write_text(json.dumps({"truth": seen.truths(true), "stood": stood, "starts": starts}))
 
 
-def visit_of(voxel_map: VoxelMap, since_ns: int) -> MapVisit:
-    """A map as it is now, its things, and its views after a stamp."""
-    snapshot = MapMirror.of(voxel_map).snapshot()
-    looks = Looks.of(voxel_map.places.places, since_ns)
+def find_start(finder: Relocalizer, views: Sequence[RoomView]) -> int:
+    """1 where a robot that starts with these views finds itself in a map, -1 where it does so wrongly, else 0."""
+    seen = list[Sighting]()
+    for frame, T in ((view.frame, view.T_world_camera) for view in views):
+        found = finder.find(frame.rgb, frame.depth_m, frame.intrinsics)
+        if isinstance(found, Relocalized):
+            seen.append(sighting(found.T_map_camera, frame.T_world_camera))
+        if not (consensus := find_consensus(seen[-REMEMBERED:])).refusal:
+            off_m, off_rad = view_distances(agreed(consensus.agreeing) @ frame.T_world_camera, T)
+            return 1 if off_m <= WITHIN_M and off_rad <= np.radians(WITHIN_DEG) else -1
+    return 0
+
+
+def things_of(home: Home, counts: np.ndarray) -> Iterator[Thing]:
+    """The countable things that enough frames saw, by how many saw each (rooms, instances)."""
+    for room, (scene, offset) in enumerate(zip(home.rooms, home.offsets, strict=True)):
+        p, m = scene.primitives, scene.materials
+        low, high = p.bounds()
+        for number in np.unique(p.instance[p.group >= SHELL]).tolist():
+            own = p.instance == number
+            label = int(p.label[own][0])
+            name = ROOMS.names[ROOMS.ids.index(label)] if label in ROOMS.ids else "floor"
+            if name in STUFF_NAMES or counts[room, number] < LEAST_FRAMES:
+                continue
+            rows, area = p.material[own], np.repeat(p.half[own].prod(axis=1) ** (2 / 3), 2)
+            colors: Float64 = np.stack((m.color_a[rows], m.color_b[rows]), axis=1).reshape(-1, 3) ** (1 / 2.2)
+            mean = area @ colors / area.sum()
+            spread = np.sqrt(area @ ((colors - mean) ** 2).sum(axis=1) / area.sum())
+            one = spread < SPREAD and not m.emission[rows].any() and not MANY & set(m.pattern[rows].tolist())
+            box = (low[own].min(axis=0) + offset).tolist(), (high[own].max(axis=0) + offset).tolist()
+            yield Thing(name, TEMPLATES[room], *box, mean.tolist() if one else None)
+
+
+def visit_of(voxel_map: VoxelMap) -> MapVisit:
+    """A map, its things, and its views."""
+    snapshot, looks = MapMirror.of(voxel_map).snapshot(), Looks.of(voxel_map.places.places)
     return MapVisit(snapshot, InstanceTracker(up=UP).update(snapshot), looks, voxel_map.last_stamp_ns)
 
 
@@ -245,17 +305,29 @@ def show(scores: Sequence[Score]) -> None:
         print(f"{kind:6s} {true:4d} true, {reported:4d} reported, {right:4d} right: F1 {f1:.2f}")
 
 
-def score_home(seed: int, arguments: argparse.Namespace, *, changes: bool) -> Score:
-    """Map a home twice and compare."""
-    before, after, truth = map_days(seed, changes=changes, own=arguments.own, apart=not arguments.goes_on)
-    began = time.perf_counter()
-    reports = compare(before, after)
-    took = time.perf_counter() - began
-    score = judge(reports, truth, arguments.say)
-    right, reported, true = (getattr(score, name).total() for name in Score._fields)
-    what = f"{right} of {true} found, {reported - right} false" if changes else f"unchanged, {reported} false"
-    print(f"home {seed}: {what}, {took:.1f} s", flush=True)
-    return score
+def kept(files: Sequence[Path], things: Sequence[Any], truth: Sequence[Truth], folder: Path) -> Counter[str]:
+    """Of what was found in the first map, by what became of it: how many, and how many have their id at the end."""
+    first, last, one = VoxelMap.load(files[0]), VoxelMap.load(files[2]), folder / "one.npz"
+    remember(first)
+    first.save(one)
+    sources = {"first": str(one), "second": str(files[1])}
+    merge_maps(sources, dict.fromkeys(sources, np.eye(4))).merged.save(one)  # both know where they are
+    changes_between(last, VoxelMap.load(one))
+    was, now = (ObjectMemory.from_bytes(m.objects).there for m in (first, last))
+    rows = [("stood", label, (low, high), (low, high)) for label, low, high in things]
+    rows += [("moved", t.label, t.before, t.after) for t in truth if t.counts and _kind(t) == "moved"]
+    counts = Counter[str]()
+    for kind, *places in ((kind, _at(was, label, a), _at(now, label, b)) for kind, label, a, b in rows):
+        before, after = places
+        counts[kind] += before is not None
+        counts[f"{kind} with id"] += before is not None and after is not None and before.id == after.id
+    return counts
+
+
+def _at(objects: Sequence[MapObject], label: int, box: Any) -> MapObject | None:
+    """The object of a class that is nearest to the middle of a true box, and at it."""
+    there = [o for o in objects if o.class_id == label and near(o.box, box)]
+    return min(there, key=lambda o: float(np.linalg.norm(o.box.center - np.mean(box, axis=0))), default=None)
 
 
 def main() -> None:
@@ -264,15 +336,28 @@ def main() -> None:
     parser.add_argument("--split", choices=tuple(SPLITS), default="tune")
     parser.add_argument("--homes", type=int, default=20)
     parser.add_argument("--own", action="store_true", help="labels of S-Ray")
-    parser.add_argument("--goes-on", action="store_true", help="the second visit goes on in the map of the first")
+    parser.add_argument("--out", type=Path, default=Path("runs/days"), help="maps; made where they are missing")
     parser.add_argument("--say", action="store_true", help="name each error")
     arguments = parser.parse_args()
-    changed, false = list[Score](), list[int]()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    changed, false, starts, ids = list[Score](), list[int](), list[int](), Counter[str]()
     for seed in SPLITS[arguments.split][: arguments.homes]:
-        changed.append(score_home(seed, arguments, changes=True))
-        false.append(score_home(seed, arguments, changes=False).reported.total())
+        path = arguments.out / f"{seed}{'-own' if arguments.own else ''}.json"
+        if not path.exists():
+            map_days(seed, arguments.own, path)
+        rows = json.loads(path.read_text())
+        truth, files = [Truth(*row) for row in rows["truth"]], [path.with_suffix(f".{day}.npz") for day in range(3)]
+        first, same, later = (visit_of(VoxelMap.load(file)) for file in files)
+        changed.append(judge(compare(first, later), truth, arguments.say))
+        false.append(judge(compare(first, same), [], arguments.say).reported.total())
+        starts += rows["starts"]
+        ids += kept(files, rows["stood"], truth, arguments.out)
+        right, reported, true = (getattr(changed[-1], name).total() for name in Score._fields)
+        print(f"home {seed}: {right} of {true} found, {reported - right} false; unchanged: {false[-1]}", flush=True)
     show(changed)
     print(f"unchanged: {sum(n > 0 for n in false)} of {len(false)} homes with a false change, {sum(false)} in all")
+    print(f"relocalised: {starts.count(1)} of {len(starts)} starts, {starts.count(-1)} wrong")
+    print(*(f"id kept: {ids[f'{kind} with id']} of {ids[kind]} that {kind}" for kind in ("stood", "moved")), sep="\n")
 
 
 if __name__ == "__main__":

@@ -47,10 +47,10 @@ class Room:
 
     def visit(self, day: int, without: int | None = None) -> MapVisit:
         """The map of the first or the second half of the frames."""
-        mapper, count = Labelled(None, NYU40), len(self._recording)
+        mapper, count = Labelled(NYU40), len(self._recording)
         for frame in self._frames(range(day * count // 2, (day + 1) * count // 2), without):
             mapper.add(frame)
-        return visit_of(mapper.voxel_map, -1)
+        return visit_of(mapper.voxel_map)
 
     def _frames(self, numbers: Sequence[int], without: int | None) -> Iterator[PosedFrame]:
         scene, labels = self._emptied(without) if without is not None else (None, np.zeros(0))

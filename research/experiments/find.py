@@ -18,27 +18,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import anyio
 import numpy as np
 from mcp import Client, StdioServerParameters, stdio_client
 
-from research.experiments.days import FRAME_NS, FRAMES, LEAST_FRAMES, LEAST_PIXELS, SPLITS, VISIT_NS, WIDTH, near
+from research.experiments.days import FRAME_NS, FRAMES, LEAST_PIXELS, SPLITS, VISIT_NS, WIDTH, Thing, near, things_of
 from research.experiments.put_things import map_frame
 from research.scenes.config import NoiseConfig
-from research.scenes.days import SHELL, TEMPLATES, Home, make_home, visit
-from research.scenes.materials import Pattern
+from research.scenes.days import make_home, visit
 from research.suites.config import camera_of_width
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.labels import ROOMS, STUFF_NAMES
+from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.find import FoundObject, find, open_objects
 from semantic_mapper.queries.instances import OrientedBox
 from semantic_mapper.queries.objects import remember
-from semantic_mapper.types import Float64
 
-SPREAD, MANY = 0.12, {Pattern.SPINES, Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE}  # of one colour; of many
 HUES = {"red": (-15, 10), "orange": (20, 38), "yellow": (48, 65), "green": (85, 155), "blue": (205, 250)}
 HUES |= {"turquoise": (170, 192), "purple": (262, 295), "pink": (305, 340)}
 NOUNS = {"sofa": ("sofa", "couch"), "refrigerator": ("refrigerator", "fridge"), "picture": ("picture", "painting")}
@@ -46,17 +43,7 @@ NOUNS |= {"cabinet": ("cabinet", "cupboard"), "bookshelf": ("bookshelf", "bookca
 NOUNS |= {"otherfurniture": ("other furniture",), "curtain": ("curtain", "drapes")}
 TOPS = {"table", "desk", "counter", "cabinet", "otherfurniture"}
 Judged = bool | None  # None = unclear
-Condition = tuple[str, str, Callable[["Thing"], Judged]]  # words before the noun, behind it, and whether it is so
-
-
-class Thing(NamedTuple):
-    """A true thing; ``rgb`` is None where it has no one colour."""
-
-    name: str
-    room: str
-    low: list[float]
-    high: list[float]
-    rgb: list[float] | None
+Condition = tuple[str, str, Callable[[Thing], Judged]]  # words before the noun, behind it, and whether it is so
 
 
 def make(seed: int, folder: Path) -> None:
@@ -70,26 +57,6 @@ def make(seed: int, folder: Path) -> None:
     assert remember(voxel_map) is not None
     (folder / f"{seed}.json").write_text(json.dumps(list(things_of(home, counts))))
     voxel_map.save(folder / f"{seed}.npz")
-
-
-def things_of(home: Home, counts: np.ndarray) -> Iterator[Thing]:
-    """The countable things that enough frames saw, by how many saw each (rooms, instances)."""
-    for room, (scene, offset) in enumerate(zip(home.rooms, home.offsets, strict=True)):
-        p, m = scene.primitives, scene.materials
-        low, high = p.bounds()
-        for number in np.unique(p.instance[p.group >= SHELL]).tolist():
-            own = p.instance == number
-            label = int(p.label[own][0])
-            name = ROOMS.names[ROOMS.ids.index(label)] if label in ROOMS.ids else "floor"
-            if name in STUFF_NAMES or counts[room, number] < LEAST_FRAMES:
-                continue
-            rows, area = p.material[own], np.repeat(p.half[own].prod(axis=1) ** (2 / 3), 2)
-            colors: Float64 = np.stack((m.color_a[rows], m.color_b[rows]), axis=1).reshape(-1, 3) ** (1 / 2.2)
-            mean = area @ colors / area.sum()
-            spread = np.sqrt(area @ ((colors - mean) ** 2).sum(axis=1) / area.sum())
-            one = spread < SPREAD and not m.emission[rows].any() and not MANY & set(m.pattern[rows].tolist())
-            box = (low[own].min(axis=0) + offset).tolist(), (high[own].max(axis=0) + offset).tolist()
-            yield Thing(name, TEMPLATES[room], *box, mean.tolist() if one else None)
 
 
 def color_of(thing: Thing) -> str | None:

@@ -20,7 +20,7 @@ from semantic_mapper.mapping.map_alignment import find_alignment
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
-from semantic_mapper.queries.instances import OrientedBox
+from semantic_mapper.queries.instances import OrientedBox, upright_box
 from semantic_mapper.queries.revisit import (
     FIXTURES,
     GONE_FREE,
@@ -171,7 +171,7 @@ class ObjectMemory:
             before: The map of the last visit and its views, in the same world; without it nothing is known to be new,
                 and surfaces are not fitted to each other.
         """
-        stamp_ns, old = now.stamp_ns, self.there
+        stamp_ns, old = now.stamp_ns, list(self.there)
         fit = Fit(None if before is None else before.snapshot, now.snapshot)
         taken = list[MapObject]()  # parts of objects that may have left, without ids yet
         if before is not None:
@@ -238,21 +238,26 @@ class ObjectMemory:
                 self._next_id += 1
         self._forget()
 
-    def _goers(self, old: Sequence[MapObject], now: MapVisit, fit: Fit) -> tuple[dict[int, Candidate], dict[int, int]]:
+    def _goers(self, old: list[MapObject], now: MapVisit, fit: Fit) -> tuple[dict[int, Candidate], dict[int, int]]:
         """Those of some objects that may have left, and how many views see each one's place without it, by position.
-        Small things that left as several pieces are one object from now on: that of the largest."""
+        Pieces that left together are one object from now on, also in ``old``, with the id of the largest."""
         evidence = dict[int, Evidence]()
         for i, thing in enumerate(old):
             if len(thing.points) < LEAST_VOXELS:
                 continue
             T = partial(fit.at, thing.box.center)
-            evidence[i] = find_evidence(now, thing.surface, lambda T=T, o=thing: transform(T(), o.surface))
+            evidence[i] = find_evidence(
+                now, thing.class_id, thing.surface, lambda T=T, o=thing: transform(T(), o.surface)
+            )
         left = [i for i, e in evidence.items() if old[i].class_name not in FIXTURES and e.free_of >= SHIFTED_FREE]
         whole = [i for i in left if evidence[i].free_of >= GONE_FREE]
         for group in touching([old[i].surface for i in whole], [old[i].class_id for i in whole]):
-            for i in sorted((whole[k] for k in group), key=lambda i: -float(np.prod(old[i].box.size)))[1:]:
+            first, *others = sorted((whole[k] for k in group), key=lambda i: -float(np.prod(old[i].box.size)))
+            for i in others:
                 left.remove(i)
                 del self._objects[old[i].id]
+            if others:
+                old[first] = self._objects[old[first].id] = _as_one([old[i] for i in (first, *others)])
         found = dict[int, Candidate]()
         for i in left:
             thing = old[i]
@@ -270,7 +275,11 @@ class ObjectMemory:
                 free.append(0.0 if before is not None else 1.0)
                 continue
             T = partial(fit.at, points.mean(axis=0))
-            free.append(find_evidence(before, points, lambda T=T, p=points: transform(invert_pose(T()), p)).free_of)
+            free.append(
+                find_evidence(
+                    before, thing.class_id, points, lambda T=T, p=points: transform(invert_pose(T()), p)
+                ).free_of
+            )
         return free
 
     def _with_id(self, thing: MapObject) -> MapObject:
@@ -369,6 +378,21 @@ def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:
     ones = [joined([now.things[j] for j in group], now.snapshot.voxel_size_m) for group in groups]
     things = [*(now.things[j] for j in kept), *ones]
     return now._replace(things=things), [*(free[j] for j in kept), *(max(free[j] for j in g) for g in groups)]
+
+
+def _as_one(pieces: Sequence[MapObject]) -> MapObject:
+    """Pieces of one object, the largest first, as it."""
+    largest, points = pieces[0], np.concatenate([piece.surface for piece in pieces])
+    box, weights = upright_box(points, largest.box.R_world_box), [float(np.prod(p.box.size)) for p in pieces]
+    looks = np.average([p.signature.astype(np.float64) ** 2 for p in pieces], axis=0, weights=weights)
+    return replace(
+        largest,
+        box=box,
+        color=np.average([p.color for p in pieces], axis=0, weights=weights).astype(np.uint8),
+        signature=np.sqrt(looks).round().astype(np.int8),
+        points=np.round((points[:: -(-len(points) // POINTS)] - box.center) * 1000).astype(np.int16),
+        places=(*largest.places[:-1], replace(largest.places[-1], box=box)),
+    )
 
 
 def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph | None:

@@ -28,6 +28,7 @@ from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 PART_FREE = 0.08  # of a thing, from which on it is looked for parts that were or are not there
 PART_VOXELS, PART_SIDE_M, PART_GAP = 60, 0.06, 1.8  # of a part at least; its shortest side; gap within, voxels
+LEAST_FILLED = 0.5  # of the largest side of its box, by its surface: less is scattered
 MOST_PART, MOST_PARTED = 0.9, 20_000  # of a thing; voxels of one that is looked at
 NEAR_M = 0.08  # of the points of two things at one place, or what their spacing is
 OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of two classes; at least
@@ -39,9 +40,9 @@ LEAST_VOXELS = 40  # of a thing that may have left or come: less is often noise
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are called whether they see through it
 LEAST_LOOKS = 2
-TOUCH_M = 0.07  # small pieces that came, or left, together and are so near to each other are one thing
+TOUCH_M = 0.035  # small pieces that came, or left, together and are so near to each other are one thing
 BEHIND_M = 0.1  # a view sees through a point where it meets the surface so far behind it
-REACH_M, PAST_M = 5.0, 4.0  # of a view, and how far past a point it is followed
+NEAREST_M, REACH_M, PAST_M = 0.6, 5.0, 4.0  # depth of a view, at least and most; how far past a point it is followed
 CELL_M, CELL_REACH_M = 2.0, 1.8  # surfaces are fitted in cells of this size, by what is so near to their middle
 FIT_POINTS, LEAST_FIT, FIT_ROUNDS = 3000, 300, 8
 FIT_TUKEY = 2.5  # voxels
@@ -106,7 +107,7 @@ class Looks:
         R, c = self.poses[views, :3, :3], self.poses[views, :3, 3]
         local = np.matmul(points[None] - c[:, None], R)
         xy = local[..., :2] / np.maximum(local[..., 2:], 1e-6)
-        inside = (local[..., 2] > 0.2) & ((local**2).sum(axis=-1) < REACH_M**2)
+        inside = (local[..., 2] > NEAREST_M) & ((local**2).sum(axis=-1) < REACH_M**2)
         inside &= (xy >= self.slopes[views, None, :2]).all(-1) & (xy <= self.slopes[views, None, 2:]).all(-1)
         return inside, c
 
@@ -251,25 +252,33 @@ def sample_points(thing: Instance, snapshot: MapSnapshot, most: int = COMPARED) 
     return thing.voxels[::every].astype(np.float64) * snapshot.voxel_size_m
 
 
-def find_evidence(visit: MapVisit, points: Float64, fitted: Callable[[], Float64]) -> Evidence:
+def find_evidence(visit: MapVisit, class_id: int, points: Float64, fitted: Callable[[], Float64]) -> Evidence:
     """What is known in a map of points (N, 3), world metres; ``fitted`` gives them as they lie where the surfaces of
     both maps are fitted, and is called where they seem not to be there."""
     voxel_m = visit.snapshot.voxel_size_m
-    free, solid = _states(visit.snapshot, points / voxel_m)
+    free, solid = _states(visit.snapshot, points / voxel_m, class_id)
     if 2 * solid.sum() > len(points) and free.sum() < SHIFTED_FREE * (free | solid).sum():
         return Evidence(free, solid, 0)
     points = fitted()
-    free, solid = _states(visit.snapshot, points / voxel_m)
+    free, solid = _states(visit.snapshot, points / voxel_m, class_id)
     through, looks = visit.looks.through(visit.snapshot, points)
     free |= ~solid & (through >= LEAST_LOOKS)
     return Evidence(free, solid, looks)
 
 
-def _states(snapshot: MapSnapshot, voxels: Float64) -> tuple[Bool, Bool]:
-    """Which of points (N, 3) in voxels are free, with no surface at one voxel from them, and which have one."""
-    states = read_states((voxels + FACES[:, None]).reshape(-1, 3), snapshot).reshape(len(FACES), -1)
-    solid = (states == State.OCCUPIED).any(axis=0)
-    return (states[0] == State.FREE) & ~solid, solid
+def _states(snapshot: MapSnapshot, voxels: Float64, class_id: int) -> tuple[Bool, Bool]:
+    """Which of points (N, 3) in voxels are free, with no surface at one voxel from them, and which have one of a class.
+    A surface of another class says nothing of a thing that stands at it."""
+    around = (voxels + FACES[:, None]).reshape(-1, 3)
+    occupied = read_states(around, snapshot) == State.OCCUPIED
+    cell = np.floor(around[occupied] + 0.5).astype(np.int64)
+    x, y, z = (cell & 7).T
+    row, there = find_sorted(snapshot.packed, pack_keys(cell >> 3))
+    own = np.zeros(len(around), np.bool_)
+    label = snapshot.voxels.label[snapshot.slots[row[there]], ((z * 8 + y) * 8 + x)[there]]
+    own[np.flatnonzero(occupied)[there]] = label == class_id
+    near, solid = (of.reshape(len(FACES), -1).any(axis=0) for of in (occupied, own))
+    return (read_states(voxels, snapshot) == State.FREE) & ~near, solid
 
 
 def parted(
@@ -284,11 +293,11 @@ def parted(
         wholes.append(thing)
         if thing.class_name != OTHER:
             continue
-        free, solid = _states(other.snapshot, sample_points(thing, visit.snapshot) / size)
+        free, solid = _states(other.snapshot, sample_points(thing, visit.snapshot) / size, thing.class_id)
         if not PART_FREE <= free.sum() / max(1, (free | solid).sum()) < GONE_FREE or len(thing.voxels) > MOST_PARTED:
             continue
         xyz = thing.voxels.astype(np.float64) * size
-        free, _ = _states(other.snapshot, lie(xyz) / size)
+        free, _ = _states(other.snapshot, lie(xyz) / size, thing.class_id)
         at, taken = np.flatnonzero(free), np.zeros(len(xyz), np.bool_)
         pairs = scipy.spatial.KDTree(xyz[at]).query_pairs(PART_GAP * size, output_type="ndarray")
         graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(at), len(at)))
@@ -296,7 +305,9 @@ def parted(
         for n in np.flatnonzero(np.bincount(number, minlength=1) >= PART_VOXELS):
             rows = at[number == n]
             part = _piece(thing, xyz, rows, up)
-            if part.box.size.min() >= PART_SIDE_M and len(rows) <= MOST_PART * len(xyz):
+            filled = len(rows) * size**2 / float(np.sort(part.box.size)[1:].prod())
+            whole = part.box.size.min() >= PART_SIDE_M and filled >= LEAST_FILLED
+            if whole and len(rows) <= MOST_PART * len(xyz):
                 parts.append((part, k))
                 taken[rows] = True
         if taken.any():

@@ -118,9 +118,28 @@ def test_what_was_brought_back_is_what_was_taken_away() -> None:
 
 def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
     grid = np.stack(np.meshgrid(*[np.linspace(0, 0.1, 3)] * 3), axis=-1).reshape(-1, 3)
-    seat, leg, other, far = (grid + np.array((x, 0, 0)) for x in (0.0, 0.16, 0.32, 0.6))
+    seat, leg, other, far = (grid + np.array((x, 0, 0)) for x in (0.0, 0.13, 0.26, 0.6))
     assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
     assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
+
+
+def test_pieces_that_left_together_are_one_thing() -> None:
+    memory, before = ObjectMemory(), visit([*two_rooms(), box(CHEST, 0.3, 0.3)], 10)
+    memory.update(before, UP)
+    (chest,) = [o for o in memory.there if o.box.size[2] > 0.3 and o.box.center[0] < 1]
+    points = np.repeat(chest.points, 2, axis=0)
+    low = points[:, 2] < 0
+    halves = [replace(chest, points=points[low]), replace(chest, id=99, points=points[~low])]
+    memory = ObjectMemory([*(o for o in memory.there if o is not chest), *halves])
+    memory.update(visit(two_rooms(), 20), UP, before=before)
+    (change,) = changes_of(memory.objects, 10)
+    assert change.kind == "gone" and change.object.id in (chest.id, 99)
+    np.testing.assert_allclose(change.object.box.size, chest.box.size, atol=0.05)
+
+
+def test_a_floor_does_not_hide_that_a_flat_thing_has_gone() -> None:
+    _, found = two_visits([*two_rooms(), box((0.4, 0.4, 0.1), 0.6, 0.6)], two_rooms())
+    assert [len(things) for things in found.values()] == [0, 0, 1]
 
 
 def test_nothing_has_gone_that_could_not_be_seen() -> None:
@@ -148,9 +167,9 @@ def test_a_view_tells_what_is_free_far_from_all_surfaces() -> None:
     corners = np.array([(x, y, 2.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)], np.float32)
     place = Place("front", 5, T_world_camera, corners, np.zeros((4, DESCRIPTOR_BYTES), np.uint8))
     seen = visit(two_rooms(), 10, (place,))
-    points = np.array([(1.5, 0.8, 1.2), (1.5, 0.8, 1.3), (3.5, 0.8, 1.2), (0.1, 0.8, 1.2)])
+    points = np.array([(1.5, 0.8, 1.2), (1.5, 0.8, 1.3), (3.5, 0.8, 1.2), (0.1, 0.8, 1.2), (0.8, 0.8, 1.2)])
     free, through = seen.looks.through(seen.snapshot, points)
-    assert free.tolist() == [1, 1, 0, 0]  # in the room; behind its wall; behind the camera
+    assert free.tolist() == [1, 1, 0, 0, 0]  # in the room; behind its wall; behind the camera; too near to it
     assert through == 1 and not len(Looks.of((place,), after_ns=5).poses)
 
 
