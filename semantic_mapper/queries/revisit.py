@@ -277,8 +277,8 @@ def _states(snapshot: MapSnapshot, voxels: Float64, class_id: int) -> tuple[Bool
     own = np.zeros(len(around), np.bool_)
     label = snapshot.voxels.label[snapshot.slots[row[there]], ((z * 8 + y) * 8 + x)[there]]
     own[np.flatnonzero(occupied)[there]] = label == class_id
-    near, solid = (of.reshape(len(FACES), -1).any(axis=0) for of in (occupied, own))
-    return (read_states(voxels, snapshot) == State.FREE) & ~near, solid
+    near = np.logical_or.reduce(occupied.reshape(len(FACES), -1))
+    return (read_states(voxels, snapshot) == State.FREE) & ~near, np.logical_or.reduce(own.reshape(len(FACES), -1))
 
 
 def parted(
