@@ -49,7 +49,7 @@ from semantic_mapper.mapping.odometry_sessions import REMEMBERED
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.merge import merge_maps
 from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
-from semantic_mapper.queries.objects import MapObject, ObjectChange, ObjectMemory, changes_between, changes_of, remember
+from semantic_mapper.queries.objects import MapObject, ObjectChange, ObjectMemory, changes_of, remember
 from semantic_mapper.queries.revisit import Looks, MapVisit
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64, PosedFrame
@@ -312,7 +312,9 @@ def kept(files: Sequence[Path], things: Sequence[Any], truth: Sequence[Truth], f
     first.save(one)
     sources = {"first": str(one), "second": str(files[1])}
     merge_maps(sources, dict.fromkeys(sources, np.eye(4))).merged.save(one)  # both know where they are
-    changes_between(last, VoxelMap.load(one))
+    before = VoxelMap.load(one)
+    last.objects, last.objects_version = before.objects, 0
+    remember(last, visit_of(before))
     was, now = (ObjectMemory.from_bytes(m.objects).there for m in (first, last))
     rows = [("stood", label, (low, high), (low, high)) for label, low, high in things]
     rows += [("moved", t.label, t.before, t.after) for t in truth if t.counts and _kind(t) == "moved"]
