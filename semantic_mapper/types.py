@@ -236,7 +236,7 @@ class MapUpdate:
     fused: bool  # False where the frame was looked at but not fused
     is_keyframe: bool  # whether the frame became a source view for later ones
     source_seqs: tuple[int, ...]  # sequence numbers of the source views that were rendered from
-    label: UInt8  # (H, W) rendered class ids, the label set's ignore id where unknown
+    label: UInt8  # (H, W) class ids: rendered, or the map's where the frame has no depth; the ignore id where unknown
     confidence: Float32  # (H, W) probability of ``label``
     depth_m: Float32  # (H, W) depth that was fused; in ``moving`` pixels that which was left out
     blocks: int  # in the map

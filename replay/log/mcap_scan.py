@@ -119,7 +119,7 @@ def _walk(fd: int, size: int) -> Scan:
 
 def last_time_ns(fd: int, place: Place) -> int:
     """Latest time of the messages of a chunk, as its head says; of anything else one that no message has."""
-    with contextlib.suppress(OSError, struct.error):  # whoever reads it meets that again
+    with contextlib.suppress(OSError, struct.error):  # reading the chunk says what is wrong
         opcode, _, _, last = _CHUNK_TIMES.unpack(os.pread(fd, _CHUNK_TIMES.size, place.offset))
         if opcode == Opcode.CHUNK:
             return last

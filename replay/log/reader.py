@@ -146,6 +146,8 @@ class LogReader:
     def frame_parts(self, from_stamp_ns: int = 0) -> Iterator[tuple[Envelope, list[bytes]]]:
         """Frames as they travel: what is known without decoding images (pose included), and the wire bytes. Chunks
         that end before ``from_stamp_ns`` are not read."""
+        if from_stamp_ns <= 0:
+            return self._parts(self._frames)
         return self._parts(e for e in self._frames if last_time_ns(e.file.fd, e.chunk) >= from_stamp_ns)
 
     def messages(self) -> Iterator[tuple[Envelope, list[bytes]]]:

@@ -270,7 +270,8 @@ def _states(snapshot: MapSnapshot, voxels: Float64, class_id: int) -> tuple[Bool
     """Which of points (N, 3) in voxels are free, with no surface at one voxel from them, and which have one of a class.
     A surface of another class says nothing of a thing that stands at it."""
     around = (voxels + FACES[:, None]).reshape(-1, 3)
-    occupied = read_states(around, snapshot) == State.OCCUPIED
+    states = read_states(around, snapshot)
+    occupied = states == State.OCCUPIED
     cell = np.floor(around[occupied] + 0.5).astype(np.int64)
     x, y, z = (cell & 7).T
     row, there = find_sorted(snapshot.packed, pack_keys(cell >> 3))
@@ -278,7 +279,7 @@ def _states(snapshot: MapSnapshot, voxels: Float64, class_id: int) -> tuple[Bool
     label = snapshot.voxels.label[snapshot.slots[row[there]], ((z * 8 + y) * 8 + x)[there]]
     own[np.flatnonzero(occupied)[there]] = label == class_id
     near = np.logical_or.reduce(occupied.reshape(len(FACES), -1))
-    return (read_states(voxels, snapshot) == State.FREE) & ~near, np.logical_or.reduce(own.reshape(len(FACES), -1))
+    return (states[: len(voxels)] == State.FREE) & ~near, np.logical_or.reduce(own.reshape(len(FACES), -1))
 
 
 def parted(

@@ -424,7 +424,7 @@ def any_basin(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
 
 
 def _hollow(a: Assembly, outside: int, inside: int, size: tuple[float, float, float], shelves: int) -> None:
-    """A carcass open towards y, with shelves; a solid one where there are none."""
+    """A carcass open towards y, with shelves; a solid one without any."""
     w, d, h = size
     if not shelves:
         a.box(outside, (0, d / 2, h / 2), (w, d, h))

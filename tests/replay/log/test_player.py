@@ -146,7 +146,7 @@ def test_what_ends_before_the_start_is_not_read(small_log: Path, endpoint: str) 
     data = bytearray(small_log.read_bytes())
     with LogReader(small_log) as reader:
         at = reader._frames[1].chunk.offset + 1000
-    data[at] ^= 1  # only whoever reads the frame meets it
+    data[at] ^= 1  # seen only where the frame is read
     small_log.write_bytes(data)
     for start, seqs in ((0, [0, *range(2, FRAMES)]), (3, [*range(3, FRAMES)])):
         options = PlayOptions(from_stamp_ns=samples.make_frame(start).stamp_ns)
