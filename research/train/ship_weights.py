@@ -22,7 +22,7 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,13 +44,23 @@ FIGURES = ("rooms", "images", "data_set", "psnr_db", "ssim", "depth_abs_rel", "e
 COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
-def chain(recipe: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The recipes of all runs that weights come from, their own first, down to those that began with random weights or
-    with those of others."""
-    yield recipe
-    for origin in recipe.get("origins") or ():
-        if not _of_others(origin):
-            yield from chain(origin["recipe"])
+def chain(recipe: dict[str, Any]) -> list[dict[str, Any]]:
+    """The recipes of all runs that weights come from, each once, from those that began with random weights (or with
+    others') to their own."""
+    runs: list[dict[str, Any]] = []
+
+    def visit(run: dict[str, Any]) -> None:
+        if run not in runs:
+            for before in _before(run):
+                visit(before)
+            runs.append(run)
+
+    visit(recipe)
+    return runs
+
+
+def _before(run: dict[str, Any]) -> list[dict[str, Any]]:
+    return [o["recipe"] for o in run.get("origins") or () if not _of_others(o)]
 
 
 def _of_others(origin: dict[str, Any]) -> bool:
@@ -181,7 +191,7 @@ def metadata_block(weights: Path) -> str:
         f"`{model.label_set.name}`, {len(model.label_set)} classes; images {checkpoint.width} pixels wide; "
         f"training rooms of suite `{recipe.get('suite')}`.",
         "",
-        f"The runs, each from the weights of the one before, the first from {_first_weights(recipe)}:",
+        f"The runs, the first from {_first_weights(recipe)}; seconds of one core or GPU:",
         "",
     ]
     parts = [*head, *_run_table(recipe), "", *_figure_table(recipe.get("figures") or ())]
@@ -197,22 +207,23 @@ def _first_weights(recipe: dict[str, Any]) -> str:
 
 
 def _run_table(recipe: dict[str, Any]) -> list[str]:
-    rows = [("kind", "trained on", "encoder sees", "steps", "weights kept", "rooms", "seed", "revision", "device", "s")]
-    for run in reversed(list(chain(recipe))):
-        config = run.get("config", {})
+    rows = [("run", "from", "trained on", "encoder sees", "steps", "weights kept", "rooms", "seed", "revision", "s")]
+    runs = chain(recipe)
+    for number, run in enumerate(runs, 1):
+        config, trained = run.get("config", {}), "steps" in run
         validations = config.get("validation", {}).get("times")
         kept = "last" if config.get("keep") == "last" else f"best of {validations}: step {run.get('best_step')}"
         rows.append(
             (
-                f"`{config.get('kind')}`",
-                _data(config),
-                _depth(config),
+                str(number),
+                ", ".join(str(runs.index(before) + 1) for before in _before(run)) or "-",
+                _data(config) if trained else "their mean",
+                _depth(config) if trained else "-",
                 _count(run.get("steps")),
-                kept,
+                kept if trained else "-",
                 _count(run.get("rooms")),
-                str(run.get("seed")),
+                str(run.get("seed", "-")),
                 f"`{str(run.get('git_revision'))[:7]}`",
-                str(run.get("device")),
                 _count(run.get("seconds")),
             )
         )

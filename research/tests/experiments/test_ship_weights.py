@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from research.suites.entries import load_entries
+from research.train.mean_weights import mean
 from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship, ship_on_base
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.weights import default_checkpoint_path
+from semantic_mapper.labels import ROOMS, make_label_set
 from tests.small import tiny_field
 
 COMMIT = "a" * 40
@@ -130,7 +132,28 @@ def test_the_card_lists_the_runs_from_the_first_to_the_last(tmp_path: Path) -> N
     path = weights(tmp_path, run(config=rays, origins=[origin(first)]))
     lines = metadata_block(path).splitlines()
     start = next(i for i, line in enumerate(lines) if "| steps |" in line)
-    assert lines[start + 2].startswith("| `unet` | images | as by default | 4,800 | best of 8: step 4200 | 3,216 | 3 |")
-    assert lines[start + 2].endswith("| `bbbbbbb` | cpu | 61 |")
-    assert lines[start + 3].startswith("| `sray` | rays | colours and depth | 1,500 | last |")
+    assert lines[start + 2].startswith("| 1 | - | images | as by default | 4,800 | best of 8: step 4200 | 3,216 | 3 |")
+    assert lines[start + 2].endswith("| `bbbbbbb` | 61 |")
+    assert lines[start + 3].startswith("| 2 | 1 | rays | colours and depth | 1,500 | last |")
     assert "Nothing was measured." in lines
+
+
+def test_a_mean_is_of_each_class_in_the_files_that_know_it_and_names_them_all(tmp_path: Path) -> None:
+    fewer = make_label_set("rooms", ROOMS.names[:-1])
+    paths, first = [tmp_path / "new.safetensors", tmp_path / "old.safetensors"], run(seed=1)
+    fields = tiny_field(seed=1), tiny_field(fewer, seed=2)
+    for path, field, recipe in zip(paths, fields, (run(seed=2, origins=[origin(first)]), first), strict=True):
+        save_checkpoint(Checkpoint(field, (), recipe), path)
+    made = mean(paths)
+    new, old, both = (f.state_dict() for f in (*fields, made.model))
+    name = next(n for n in new if n.startswith("encoder.") and n.endswith("weight"))
+    torch.testing.assert_close(both[name], (new[name] + old[name]) / 2)
+    rows = "classifier.weight"
+    torch.testing.assert_close(both[rows][:-1], (new[rows][:-1] + old[rows]) / 2)
+    torch.testing.assert_close(both[rows][-1], new[rows][-1])
+    save_checkpoint(made, tmp_path / "mean.safetensors")
+    lines = metadata_block(tmp_path / "mean.safetensors").splitlines()
+    table = [line[:9] for line in lines if line.startswith("| ") and line[2].isdigit()]
+    assert table == ["| 1 | - |", "| 2 | 1 |", "| 3 | 2, "]  # each run once, the mean behind those that it is of
+    with pytest.raises(ConfigError, match=f"knows {ROOMS.names[-1]}.*name this file first"):
+        mean(paths[::-1])
