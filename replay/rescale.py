@@ -12,7 +12,7 @@ import numpy as np
 from semantic_mapper.bundle.scale import find_floor
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.fields.weights import shipped_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.artifacts import clear_results
@@ -69,7 +69,7 @@ def rescale_run(
         factor, scale = _factor(metres, points, xyz, positions, reader.info.metadata.get(FLOOR_KEY, ""))
         config = convert_config(summary["config"], MapperConfig, str(folder / SUMMARY_FILE))
         name = Path(str(dig(summary, "weights.file")))
-        if weights is None and shipped_checkpoint(Path(name.stem)) is None:
+        if weights is None and name.name != default_checkpoint_path().name:
             raise ConfigError(f"{folder}: was mapped with {name}; name the file with --weights")
         old = reader.info.metadata
         depth = scene_depth(factor * float(old[SCENE_DEPTH_KEY])) if SCENE_DEPTH_KEY in old else {}
@@ -79,7 +79,7 @@ def rescale_run(
             for _, parts in reader.frame_parts():
                 writer.write_parts(scaled_frame(parts, factor))
         count = 0 if summary.get("stopped_by") else int(dig(summary, "frames.published") or 0)
-        new, _ = replay_log(scaled, made, weights or Path(name.stem), config, count, monitor=monitor)
+        new, _ = replay_log(scaled, made, weights, config, count, monitor=monitor)
         if not new["stopped_by"]:
             clear_results(folder)
             os.replace(scaled, folder / log.name)

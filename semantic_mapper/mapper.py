@@ -13,7 +13,7 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.base import StreamField
 from semantic_mapper.fields.domain_check import find_domain_check
 from semantic_mapper.fields.streaming import StreamingSRay
-from semantic_mapper.fields.weights import WeightsFile, default_checkpoint_path, find_checkpoint, load_weights
+from semantic_mapper.fields.weights import WeightsFile, default_checkpoint_path, load_weights
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -45,7 +45,7 @@ class Mapper:
         if not isinstance(config, MapperConfig):
             config = MapperConfig() if config is None else load_config(Path(config), MapperConfig)
         config = with_quality(config)
-        path = default_checkpoint_path() if weights is None else find_checkpoint(Path(weights))
+        path = default_checkpoint_path() if weights is None else Path(weights)
         found = load_weights(path)
         if config.render.encode_width == 0:
             config = replace(config, render=replace(config.render, encode_width=found.width))

@@ -129,18 +129,17 @@ def import_source(
     reading: ImportOptions | None = None,
     *,
     overwrite: bool,
-) -> int:
-    """Import a film or a recording, with progress, and say what became of it; how many frames have measured depth.
+) -> None:
+    """Import a film or a recording, with progress, and say what became of it.
     Raises typer.BadParameter: options that do not go with the source. SemanticMapperError: it cannot be imported."""
     if format_name is None and is_film(source):
         _import_film(output, source, log, options.film_options(), overwrite=overwrite)
-        return 0
+        return
     reading = options.reading(reading or ImportOptions())
     with frame_progress("import", None) as bar:
         show = partial(bar.report, "")
         report = import_recording(source, log, format_name, show, options=reading, overwrite=overwrite)
     _print_import(output, report, log)
-    return report.with_depth
 
 
 def _topics_by_role(texts: list[str]) -> dict[str, str]:

@@ -66,7 +66,7 @@ def map_(
     """
     must_be_there(*source)
     refuse_options((view and rerun, "--view and --rerun", "show the same; give one of them"))
-    from semantic_mapper.fields.weights import COMPUTED_DEPTH, load_weights
+    from semantic_mapper.fields.weights import load_weights
     from semantic_mapper.replay.map_log import OFFLINE, replay_log
 
     config = mapper.load(OFFLINE)
@@ -85,8 +85,8 @@ def map_(
             raise LogError(f"{log}: is a bag, which the log would replace; choose another folder by --out")
         with hold_folder(out):
             reading = ImportOptions(max_frames=max_frames or None)  # the rest would not be mapped
-            with_depth = import_source(output, source[0], log, options, reading=reading, overwrite=True)
-        source, weights = [log], weights or (None if with_depth else COMPUTED_DEPTH)
+            import_source(output, source[0], log, options, reading=reading, overwrite=True)
+        source = [log]
     elif options.given:
         raise typer.BadParameter(
             "a log is mapped as it is; options of `import` go with what is imported", param_hint="SOURCE"

@@ -39,7 +39,7 @@ def refine(
         raise typer.BadParameter("goes with --weights; without, other classes are smoothed", param_hint="--by-name")
     path = map_path(source)
     refuse_overwriting(out, path)
-    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED
+    from semantic_mapper.fields.nesf import DEFAULT, SMOOTHED
     from semantic_mapper.replay.refine_map import refine_map
 
     with frame_progress("refine", None, unit="tiles") as bar:
@@ -57,6 +57,6 @@ def refine(
     if digest == SMOOTHED:
         output.print("the votes were smoothed, nothing was learned")
     else:
-        output.print(f"refined by the weights {weights or SHIPPED}")
+        output.print(f"refined by the weights {(weights or DEFAULT).name}")
     output.print(f"{out}: {percent(report.relabelled)} of the surface relabelled, {percent(report.filled)} filled")
     output.json(asdict(report) | {"weights": digest, "out": str(out)})

@@ -57,9 +57,7 @@ _log = structlog.get_logger(__name__)
 ConfigT = TypeVar("ConfigT", bound=Config)
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone (docs/json.md)")]
 JsonOutput = Annotated[Output, JsonOption]  # of a verb that has this option
-WeightsOption = Annotated[
-    Path | None, typer.Option("--weights", help="File, or `rooms-computed-depth` (no depth sensor)")
-]
+WeightsOption = Annotated[Path | None, typer.Option("--weights", help="A weights file; the default ships")]
 MaxFramesOption = Annotated[NotNegative, typer.Option(help="Stop after this many; 0 = all")]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what is there")]

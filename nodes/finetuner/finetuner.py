@@ -11,7 +11,7 @@ import torch
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import CodecError, FrameError, LabelError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, build_checkpoint, checkpoint_bytes, load_checkpoint
-from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
 from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
@@ -129,7 +129,7 @@ class Finetuner:
         self.context, self.options = context, options
         self.publisher, self.labels, self.mapper = publisher, labels, mapper
         self.config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
-        path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
+        path = Path(options.weights) if options.weights else default_checkpoint_path()
         start = self.start = load_checkpoint(path)  # what the mapper was started with
         self.start_digest = digest_of(path.read_bytes())
         self._report = StatusReport(context.name, publisher)

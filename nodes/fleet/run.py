@@ -37,7 +37,6 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError, FleetError, LogError, StoreError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
-from semantic_mapper.fields.weights import shipped_checkpoint
 from semantic_mapper.files import write_json
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.nodes.fleet.store import (
@@ -51,7 +50,6 @@ from semantic_mapper.nodes.fleet.store import (
     fetch,
     file_digest,
     full_url,
-    is_url,
     open_url,
     reaching,
 )
@@ -87,7 +85,7 @@ class Task:
     store: str  # URL of the store
     settings: Mapping[str, Any]  # plain data of the operation's kind
     shown_settings: Mapping[str, Any]  # what was set, for people
-    weights: str  # their file's name, or the name of weights that ship with the package; empty = the default ones
+    weights: str  # their file's name; empty = those that ship with the package
     weights_data: bytes  # content of their file; empty = they ship with the package
     code: str  # digest of the code that the driver has
 
@@ -127,7 +125,7 @@ def make_task(
     Args:
         operation: Of ``OPERATIONS``.
         out: Path or URL of the store, which is made where nothing is.
-        weights: File, URL, or name of weights that ship; None = the default ones.
+        weights: File or URL; None = those that ship with the package.
         assignments: As of ``--set``, such as ``max_frames=100``; they go before ``config``, a TOML file of such names.
     """
     found = OPERATIONS[operation]
@@ -230,9 +228,7 @@ def _count(reference: Any, report: RunReport) -> str:
 
 
 def _read_weights(weights: str) -> tuple[str, bytes]:
-    """Name and content; no content for weights that ship."""
-    if not is_url(weights) and not Path(weights).is_file() and shipped_checkpoint(Path(weights)) is not None:
-        return weights, b""
+    """Name and content."""
     with tempfile.TemporaryDirectory() as folder, reaching(weights):
         local = fetch(weights, Path(folder) / _name_of(weights))
         data = local.read_bytes()

@@ -11,7 +11,7 @@ from semantic_mapper.config import convert_config, load_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import save_nesf
-from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.nodes.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.process import StopRequest
 
@@ -42,7 +42,7 @@ def train_on_maps(
     folder = out.with_name(f"{out.stem}-training") if is_file else out
     file = out if is_file else out / WEIGHTS_FILE
     maps_folder = Path(settings.maps) if settings.maps else folder / "maps"
-    weights = find_checkpoint(Path(settings.weights)) if settings.weights else default_checkpoint_path()
+    weights = Path(settings.weights) if settings.weights else default_checkpoint_path()
     with sole_use_of(folder), StopRequest() as stop:
         paths, held_out = _maps(settings, maps_folder, weights, stop)
         if stop:

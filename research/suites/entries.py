@@ -16,7 +16,6 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.weights import find_checkpoint
 
 
 def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:
@@ -28,7 +27,6 @@ def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry
         kinds: Names of ``fields.learned`` that take part with random weights and default settings, after the files.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    paths = [find_checkpoint(path) for path in paths]
     checkpoints = [load_checkpoint(path) for path in paths]
     # The config too: a file of before may lack a setting, whose default changes what the weights do.
     digests = [

@@ -22,7 +22,7 @@ from research.suites.config import MAP_WIDTH, SequenceConfig, camera_of_width
 from research.train.nesf import TrainingMap
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.fields.nesf import find_rows, pack_cells
-from semantic_mapper.fields.weights import default_checkpoint_path, find_checkpoint, open_weights
+from semantic_mapper.fields.weights import default_checkpoint_path, open_weights
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger
@@ -141,7 +141,7 @@ def _digest_of(what: dict[str, Any]) -> str:
 
 
 def _field_digest(weights: Path | None) -> str:
-    path = default_checkpoint_path() if weights is None else find_checkpoint(weights)
+    path = default_checkpoint_path() if weights is None else weights
     open_weights(path)  # says what is wrong with them
     return _file_digest(path)
 

@@ -7,10 +7,6 @@ Convert, measure what was converted with depth and without, ship it; shipping al
     semantic-mapper-research suite rooms --weights HALF --out off.json --depth off
     python -m research.train.ship_weights HALF --figures on.json --figures off.json
 
-Ship weights under another name, without the tensors that the default weights hold alike:
-
-    python -m research.train.ship_weights HALF --name rooms-people
-
 Renew that table alone, from what the weights in the package say of themselves:
 
     python -m research.train.ship_weights --card
@@ -27,14 +23,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from research.suites.entries import load_entries
 from semantic_mapper.errors import ConfigError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.weights import default_checkpoint_path, open_weights, save_tensors
+from semantic_mapper.fields.weights import default_checkpoint_path
 
 CARD = Path(__file__).resolve().parents[2] / "docs" / "model-card.md"
 BEGIN, END = "<!-- metadata -->", "<!-- /metadata -->"
@@ -143,24 +137,6 @@ def ship(half: Path, tables: Sequence[Path], out: Path, card: Path) -> None:
     recipe = checkpoint.recipe | {"figures": both_figures(half, tables)}
     _save(replace(checkpoint, recipe=recipe), out)
     renew_card(card, out)
-
-
-def ship_on_base(half: Path, out: Path) -> None:
-    """Write weights to ``out`` without the tensors that the default weights hold alike, naming those as their base.
-
-    Ship them again whenever the default weights change. Raises WeightsError: unreadable, or of a run that nobody can do
-    again.
-    """
-    check_chain(half, load_checkpoint(half).recipe)
-    base = default_checkpoint_path()
-    tensors, metadata = open_weights(half)
-    theirs, _ = open_weights(base)
-    own = {name: t for name, t in tensors.items() if name not in theirs or not _same(t, theirs[name])}
-    save_tensors(own, out, metadata | {"base": base.stem})
-
-
-def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    return a.dtype == b.dtype and np.array_equal(a, b)
 
 
 def as_stored(tensor: torch.Tensor, name: str) -> torch.Tensor:
@@ -310,7 +286,6 @@ def main() -> int:
     verb = parser.add_mutually_exclusive_group(required=True)
     verb.add_argument("--half-only", type=Path, metavar="OUT", help="convert only, so that it can be measured")
     verb.add_argument("--figures", type=Path, action="append", metavar="JSON", help="twice: with and without depth")
-    verb.add_argument("--name", help="ship under this name, without what the default weights hold alike")
     verb.add_argument("--card", action="store_true", help="renew the table of the model card, and print it")
     given = parser.parse_args()
     if (given.weights is None) != given.card:
@@ -321,8 +296,6 @@ def main() -> int:
             convert(given.weights, given.half_only)
         elif given.figures:
             ship(given.weights, given.figures, package, CARD)
-        elif given.name:
-            ship_on_base(given.weights, package.with_name(f"{given.name}.safetensors"))
         else:
             renew_card(CARD, package)
             print(metadata_block(package), end="")

@@ -17,7 +17,7 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.learned import LearnedField, build_field
 from semantic_mapper.fields.streaming import StreamedViews, StreamingSRay
 from semantic_mapper.fields.views import EncodedViews
-from semantic_mapper.fields.weights import MESSAGE, Tensors, WeightsFile, find_checkpoint, load_weights, weights_bytes
+from semantic_mapper.fields.weights import MESSAGE, Tensors, WeightsFile, load_weights, weights_bytes
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import PosedFrame
@@ -100,9 +100,8 @@ def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a weights file; a name of weights that ship with the package ("rooms-computed-depth") will do.
+    """Read a weights file.
     Raises WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config."""
-    path = find_checkpoint(path)
     return build_checkpoint(load_weights(path), path)
 
 

@@ -29,8 +29,8 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import load_tensors
 from semantic_mapper.fields.weights import (
     MAP_KIND,
+    SHIPPED,
     describe,
-    find_checkpoint,
     open_weights,
     refusing_damage,
     save_tensors,
@@ -39,7 +39,7 @@ from semantic_mapper.fields.weights import (
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
-SHIPPED = Path("nesf-rooms")  # names the weights that ship, for maps of the classes of ROOMS
+DEFAULT = SHIPPED / "nesf-rooms.safetensors"  # for maps of the classes of ROOMS
 SMOOTHING = Path("smoothed")  # in place of weights: votes are smoothed, nothing is learned
 CELL_M = 0.04
 SHAPE_CHANNELS = 9  # before those of the classes
@@ -416,7 +416,7 @@ def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
     WeightsError: no such file, damaged, or weights of another kind."""
     if weights == SMOOTHING:
         return smoothed_votes(label_set)
-    found = load_nesf(weights or SHIPPED)
+    found = load_nesf(weights or DEFAULT)
     own = found.model.label_set
     if len(own) < len(label_set) and (own.ids, own.names) == (label_set.ids[: len(own)], label_set.names[: len(own)]):
         return replace(found, model=found.model.extended(label_set))
@@ -434,7 +434,6 @@ def save_nesf(weights: NesfWeights, path: Path) -> None:
 
 def load_nesf(path: Path) -> NesfWeights:
     """Read weights that ``save_nesf`` wrote. Raises WeightsError: no such file, damaged, or weights of another kind."""
-    path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
     if metadata.get("field") != MAP_KIND:
         raise WeightsError(

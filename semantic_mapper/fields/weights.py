@@ -2,8 +2,6 @@
 
 What reads them here needs no torch; ``checkpoint`` makes a network of them.
 
-Weights that ship may name others that ship as their ``base``, and then hold only the tensors that differ from those.
-
 A finetuned file carries its *anchors*: the labelled keyframes it was finetuned on, as images at working resolution
 with depth, labels and pose. They are source views of every later render in the same scene.
 """
@@ -44,7 +42,6 @@ DEFAULT_WIDTH = 320  # of weights whose recipe does not say
 DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
 # Names of modules that ``encode`` of a kind uses, where that is known.
 ENCODING_PARTS = {"sray": ("encoder", "geometry_init")}
-COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
 SHIPPED = Path(str(resources.files("semantic_mapper"))) / "weights"
 
 
@@ -83,17 +80,6 @@ def default_checkpoint_path() -> Path:
     return SHIPPED / "rooms.safetensors"
 
 
-def find_checkpoint(path: Path) -> Path:
-    """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
-    return path if path.exists() and not path.is_dir() else shipped_checkpoint(path) or path
-
-
-def shipped_checkpoint(name: Path) -> Path | None:
-    """Weights that ship with the package under a name; None where they are missing."""
-    named = SHIPPED / f"{name}.safetensors"
-    return named if name.parent == Path() and named.exists() else None
-
-
 def weights_bytes(weights: WeightsFile, *, half: bool = False) -> bytes:
     """The content of a weights file; with ``half`` weights are float16.
     Raises SafetensorError: tensors that the format does not know."""
@@ -128,9 +114,8 @@ def save_tensors(tensors: Tensors, path: Path, metadata: dict[str, str]) -> None
 
 
 def load_weights(path: Path) -> WeightsFile:
-    """Read a weights file; a name of weights that ship with the package ("rooms-computed-depth") will do.
+    """Read a weights file.
     Raises WeightsError: missing, damaged, of another format or version, or weights that hold NaN."""
-    path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
     with refusing_damage(path):
         label_set = unpack_label_set(metadata["label_set"])
@@ -180,13 +165,13 @@ def refusing_damage(path: Path) -> Generator[None]:
 
 
 def open_weights(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Tensors and metadata of a weights file of this project, of any kind, joined with those of its base.
-    Raises WeightsError: missing, damaged, of another format or version, or its base is."""
+    """Tensors and metadata of a weights file of this project, of any kind.
+    Raises WeightsError: missing, damaged, of another format or version."""
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():
-        named = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
-        raise WeightsError(f"{path}: no such weights file, nor weights of the package{nearest(path.name, named)}")
+        near = nearest(path.name, sorted(file.name for file in path.parent.glob("*.safetensors")))
+        raise WeightsError(f"{path}: no such weights file{near}")
     try:
         with safe_open(path, framework="np") as stored:
             metadata = dict(stored.metadata() or {})
@@ -196,11 +181,6 @@ def open_weights(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     found = metadata.get("format"), metadata.get("version")
     if found != (FORMAT, str(VERSION)):
         raise WeightsError(f"{path}: not weights of this project that this version reads ({FORMAT} {VERSION})")
-    if "base" in metadata:
-        base = shipped_checkpoint(Path(metadata["base"]))
-        if base is None or base == path:
-            raise WeightsError(f"{path}: needs the weights '{metadata['base']}', which do not ship with this version")
-        tensors = open_weights(base)[0] | tensors
     return tensors, metadata
 
 

@@ -104,7 +104,7 @@ class MovingFilter:
         if config.moving.classes and not self._ids and not sees_moving:
             raise ConfigError(
                 f"moving.classes: none of the classes of '{label_set.name}' moves ({', '.join(sorted(MOVING_NAMES))} "
-                "would); use weights that know one (`rooms-people` ship), a segmenter, or moving.motion"
+                "would); use weights that know one, a segmenter, or moving.motion"
             )
         self.pixels = 0
         self.space = MovingSpace()

@@ -14,12 +14,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, WEIGHTS, read
 from tests.contract.test_map import unlike
 
-RENDERED = ("rooms", "rooms-computed-depth", "rooms-people", str(WEIGHTS))
+RENDERED = (str(default_checkpoint_path()), str(WEIGHTS))
 BOXES = [
     {"id": 1, "class": "cabinet", "T_world_box": [[1, 0, 0, 2.7], [0, 1, 0, 0.6], [0, 0, 1, 1.7], [0, 0, 0, 1]]},
     {"id": 2, "class": "chair", "T_world_box": [[1, 0, 0, 1.4], [0, 1, 0, 0.6], [0, 0, 1, 0.5], [0, 0, 0, 1]]},

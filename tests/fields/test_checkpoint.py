@@ -11,11 +11,8 @@ from safetensors.torch import save_file
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.weights import (
-    COMPUTED_DEPTH,
     anchor_from_frame,
-    default_checkpoint_path,
     encode_alike,
-    find_checkpoint,
     load_weights,
     weights_bytes,
 )
@@ -108,22 +105,6 @@ def test_metadata_that_cannot_be_used_are_refused_with_the_reason(tmp_path, chan
         load_checkpoint(path)
 
 
-def test_weights_that_name_a_base_hold_the_rest_of_its_tensors(tmp_path):
-    base = load_checkpoint(default_checkpoint_path())
-    path = tmp_path / "w.safetensors"
-    save_checkpoint(base, path)
-    with safe_open(path, framework="pt") as stored:
-        own = {"model.classifier.bias": stored.get_tensor("model.classifier.bias") + 1}
-        metadata = stored.metadata()
-    save_file(own, path, metadata | {"base": "rooms"})
-    loaded, expected = load_checkpoint(path).model.state_dict(), base.model.state_dict()
-    expected["classifier.bias"] = expected["classifier.bias"] + 1
-    assert all(torch.equal(loaded[name], tensor) for name, tensor in expected.items())
-    save_file(own, path, metadata | {"base": "rooms-of-before"})
-    with pytest.raises(WeightsError, match="'rooms-of-before', which do not ship"):
-        load_checkpoint(path)
-
-
 def test_anchors_with_computed_depth_keep_its_spread(tmp_path):
     frame = tiny_frames(1)[0]
     computed = dataclasses.replace(frame, depth_sigma_m=np.float32(0.05) * frame.depth_m)
@@ -135,13 +116,9 @@ def test_anchors_with_computed_depth_keep_its_spread(tmp_path):
     np.testing.assert_allclose(kept.depth_sigma_m, 0.05 * kept.depth_m, atol=5e-4)
 
 
-def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    shipped = find_checkpoint(COMPUTED_DEPTH)
-    assert shipped.name == "rooms-computed-depth.safetensors" and shipped.exists()
-    assert load_checkpoint(COMPUTED_DEPTH).model.config.encoder.computed_depth
-    assert Mapper.load(COMPUTED_DEPTH).weights_path == shipped
-    COMPUTED_DEPTH.write_bytes(b"mine")
-    assert find_checkpoint(COMPUTED_DEPTH) == COMPUTED_DEPTH
-    with pytest.raises(WeightsError, match="no such weights file"):
-        load_checkpoint(tmp_path / "rooms-computed-depth.else")
+def test_a_missing_file_is_named_with_one_that_is_there(tmp_path):
+    (tmp_path / "kitchen.safetensors").touch()
+    with pytest.raises(
+        WeightsError, match=r"kichen\.safetensors: no such weights file.*did you mean `kitchen\.safetensors`"
+    ):
+        load_checkpoint(tmp_path / "kichen.safetensors")

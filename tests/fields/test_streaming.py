@@ -18,7 +18,7 @@ from semantic_mapper.fields.numbers import UNSURE_SPREAD
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.streaming import StreamedViews, StreamingSRay
 from semantic_mapper.fields.volume import sample_guided, sample_inverse_depth
-from semantic_mapper.fields.weights import COMPUTED_DEPTH, default_checkpoint_path
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import resize_depth, resize_rgb
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -86,7 +86,6 @@ FIELDS = {
     "colours alone": lambda: random_field(encoder=msgspec.structs.replace(SMALL_ENCODER, depth=False)),
     "backbone": lambda: random_field(encoder=BACKBONE),
     "shipped": lambda: load_checkpoint(default_checkpoint_path()).model,
-    "shipped for computed depth": lambda: load_checkpoint(COMPUTED_DEPTH).model,
 }
 
 

@@ -13,7 +13,7 @@ from research.tests.cli.support import run
 from research.train.map_grids import made_of_room, training_map
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.nesf import load_nesf
-from semantic_mapper.fields.weights import find_checkpoint
+from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.labels import ROOMS
 from tests.mapping.test_refine import UP, make_map
 from tests.nodes.support import COMMAND as PRODUCT
@@ -91,7 +91,7 @@ def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> 
 
 def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     frames = tiny_frames()
-    field = hashlib.sha256(find_checkpoint(Path("rooms-people")).read_bytes()).hexdigest()
+    field = hashlib.sha256(default_checkpoint_path().read_bytes()).hexdigest()
     for name, seed, rendered in (("100000", 100_000, 1), ("50000", 50_000, 1), ("50000-every-4", 50_000, 4)):
         found = training_map(make_map(), frames, ROOMS, UP)
         made_of = made_of_room(seed, field, rendered=rendered)
@@ -99,7 +99,6 @@ def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(
         f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
-        'weights = "rooms-people"\n'
         "labelled_voxels = 500\nvalidate_every = 2\n[field]\nwidth = 2\n",
         encoding="utf-8",
     )

@@ -9,10 +9,9 @@ import torch
 
 from research.suites.entries import load_entries
 from research.train.mean_weights import mean
-from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship, ship_on_base
+from research.train.ship_weights import BEGIN, END, convert, figures_of, metadata_block, ship
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.weights import default_checkpoint_path
 from semantic_mapper.labels import ROOMS, make_label_set
 from tests.small import tiny_field
 
@@ -79,18 +78,6 @@ def test_what_was_measured_is_shipped_bit_by_bit_with_its_figures(tmp_path: Path
     assert shipped.recipe["figures"][0]["measured"] == load_entries([half])[0].digest
     assert shipped.width == 160
     assert page.read_text(encoding="utf-8") == f"# Card\n\n{BEGIN}\n{metadata_block(out)}{END}\n\nProse.\n"
-
-
-def test_weights_shipped_on_a_base_read_back_alike_and_smaller(tmp_path: Path) -> None:
-    half, out = tmp_path / "half.safetensors", tmp_path / "out.safetensors"
-    base = load_checkpoint(default_checkpoint_path())
-    base.model.label_logit.data += 1
-    save_checkpoint(Checkpoint(base.model, (), run()), half, half=True)
-    ship_on_base(half, out)
-    assert out.stat().st_size < half.stat().st_size / 50
-    loaded = load_checkpoint(out)
-    assert all(torch.equal(loaded.model.state_dict()[name], t) for name, t in base.model.state_dict().items())
-    assert loaded.recipe == run()
 
 
 def test_weights_that_were_measured_before_they_were_converted_are_refused(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import pytest
 from research.suites.entries import load_entries
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
-from semantic_mapper.fields.weights import COMPUTED_DEPTH
 from tests.small import tiny_field
 
 
@@ -41,8 +40,3 @@ def test_the_same_weights_twice_are_refused(tmp_path: Path):
     shutil.copy(a, tmp_path / "b.safetensors")
     with pytest.raises(WeightsError, match="given twice"):
         load_entries([a, tmp_path / "b.safetensors"])
-
-
-def test_weights_that_ship_are_known_by_their_name() -> None:
-    (entry,) = load_entries([COMPUTED_DEPTH])
-    assert entry.name == "rooms-computed-depth" and entry.field.config.encoder.computed_depth

@@ -28,7 +28,7 @@ def test_missing_weights_unknown_settings_and_bad_corrections_are_named(log: Pat
     wrong.write_text("[voxel_map]\nvoxel_sise_m = 0.05\n")
     corrections.write_text("no trajectory\n")
     for option, file, code, said in (
-        ("--weights", "rooms-poeple", 1, "did you mean `rooms-people`?"),
+        ("--weights", "rooms.safetensor", 1, "rooms.safetensor: no such weights file"),
         ("--config", wrong, 2, "did you mean `voxel_size_m`?"),
         ("--corrections", corrections, 1, "corrections.txt: holds no pose"),
     ):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
+from semantic_mapper.fields.nesf import DEFAULT, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.test_refine import make_map, random_weights
@@ -38,7 +38,7 @@ def test_a_refined_map_is_a_map_like_any_other(files: Path, tmp_path: Path) -> N
     assert found["filled"] == 0 and found["relabelled"] > 0
     assert sum(found["before"].values()) == sum(found["after"].values()) == found["surface"]
     run_ok("refine", files, "--up", "z", "--out", out)
-    assert VoxelMap.load(out).refined == load_nesf(SHIPPED).digest
+    assert VoxelMap.load(out).refined == load_nesf(DEFAULT).digest
 
 
 def test_maps_of_other_classes_than_the_weights_that_ship_are_smoothed(tmp_path: Path) -> None:

@@ -126,6 +126,6 @@ def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked:
     assert done.returncode == 0, done.stderr
     assert str(out / "report.html") in done.stdout
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["weights"]["file"] == "rooms-computed-depth.safetensors"
+    assert summary["weights"]["file"] == "rooms.safetensors"
     assert summary["scale"] == "unknown" and summary["frames"]["left_out"] + summary["frames"]["published"] == COUNT
     assert {"room.mcap", "report.html", "map.ply", "map.npz"} <= {file.name for file in out.iterdir()}
