@@ -107,9 +107,9 @@ def both_figures(weights: Path, tables: Sequence[Path]) -> list[dict[str, Any]]:
 
     Raises ConfigError: other tables than one with and one without depth that agree in all else; see ``figures_of``.
     """
-    figures = sorted((figures_of(weights, table) for table in tables), key=lambda figure: not figure["depth"])
+    figures = sorted((figures_of(weights, table) for table in tables), key=lambda figure: figure["depth"] != "on")
     alike = {tuple(figure[key] for key in SETTINGS if key != "depth") for figure in figures}
-    if [figure["depth"] for figure in figures] != [True, False] or len(alike) != 1:
+    if [figure["depth"] for figure in figures] != ["on", "off"] or len(alike) != 1:
         raise ConfigError("--figures: give two tables of the same settings, one with and one without `--depth off`")
     return figures
 
@@ -222,7 +222,7 @@ def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
         f"Measured with {of_what} on {first['rooms']} rooms of the {first['split']} split, {first['images']} images, "
         f"protocol `{first['protocol']}`, {first['views']} views, {_sources(first)}:"
     )
-    rows = [("", *("sensor depth" if figure["depth"] else "no depth" for figure in figures))]
+    rows = [("", *("sensor depth" if figure["depth"] == "on" else "no depth" for figure in figures))]
     for name, key in (("mIoU", "miou"), ("total accuracy", "total_accuracy"), ("average accuracy", "average_accuracy")):
         rows.append((name, *(_percent(figure["data_set"].get(key)) for figure in figures)))
     rows.append(("calibration error", *(_percent(figure.get("ece")) for figure in figures)))
@@ -230,8 +230,7 @@ def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
     rows.append(("depth, relative error", *(_percent(figure.get("depth_abs_rel")) for figure in figures)))
     rows.append(("PSNR, dB", *(_number(figure.get("psnr_db"), 1) for figure in figures)))
     rows.append(("SSIM", *(_number(figure.get("ssim"), 3) for figure in figures)))
-    missing = [] if len(figures) > 1 else ["", f"Not measured {'without' if first['depth'] else 'with'} depth."]
-    return [title, "", *_markdown(rows), *missing]
+    return [title, "", *_markdown(rows)]
 
 
 def _markdown(rows: Sequence[tuple[str, ...]]) -> list[str]:

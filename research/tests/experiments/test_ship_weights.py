@@ -34,7 +34,7 @@ def weights(folder: Path, recipe: dict[str, Any] | None = None) -> Path:
     return path
 
 
-def table(path: Path, digest: str, *, depth: bool = True, views: int = 8, **changes: Any) -> Path:
+def table(path: Path, digest: str, *, depth: str = "on", views: int = 8, **changes: Any) -> Path:
     suite = {
         "split": "test",
         "protocol": "generalize",
@@ -43,7 +43,7 @@ def table(path: Path, digest: str, *, depth: bool = True, views: int = 8, **chan
         "own_image": True,
         "depth": depth,
     }
-    figures = {"rooms": 20, "images": 80, "data_set": {"miou": 0.7 if depth else 0.5}, "ece": 0.02}
+    figures = {"rooms": 20, "images": 80, "data_set": {"miou": 0.7 if depth == "on" else 0.5}, "ece": 0.02}
     entry = {"digest": digest, "figures": figures}
     found = {"suite": suite | {"rooms": 0}, "complete": True, "weights": {"w": entry}} | changes
     path.write_text(json.dumps(found), encoding="utf-8")
@@ -54,7 +54,7 @@ def tables(folder: Path, weights: Path, **changes: Any) -> list[Path]:
     """With depth and without."""
     digest = load_entries([weights])[0].digest
     return [
-        table(folder / "off.json", digest, depth=False),
+        table(folder / "off.json", digest, depth="off"),
         table(folder / "on.json", digest, **changes),
     ]
 
@@ -72,7 +72,7 @@ def test_what_was_measured_is_shipped_bit_by_bit_with_its_figures(tmp_path: Path
     measured, shipped = load_checkpoint(half), load_checkpoint(out)
     state = shipped.model.state_dict()
     assert all(torch.equal(state[name], tensor) for name, tensor in measured.model.state_dict().items())
-    assert [figure["depth"] for figure in shipped.recipe["figures"]] == [True, False]
+    assert [figure["depth"] for figure in shipped.recipe["figures"]] == ["on", "off"]
     assert [figure["data_set"]["miou"] for figure in shipped.recipe["figures"]] == [0.7, 0.5]
     assert shipped.recipe["figures"][0] == figures_of(half, tmp_path / "on.json")
     assert shipped.recipe["figures"][0]["measured"] == load_entries([half])[0].digest
