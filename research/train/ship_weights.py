@@ -34,7 +34,7 @@ CARD = Path(__file__).resolve().parents[2] / "docs" / "model-card.md"
 BEGIN, END = "<!-- metadata -->", "<!-- /metadata -->"
 MOST_BYTES = 16_000_000
 SETTINGS = ("split", "protocol", "views", "sources", "own_image", "depth")
-FIGURES = ("rooms", "images", "data_set", "psnr_db", "ssim", "depth_abs_rel", "ece", "consistency")
+FIGURES = ("rooms", "images", "data_set", "depth_abs_rel", "ece", "consistency")
 COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -65,20 +65,13 @@ def _of_others(origin: dict[str, Any]) -> bool:
 def check_chain(weights: Path, recipe: dict[str, Any]) -> None:
     """See to it that every run behind ``weights`` can be done again.
 
-    Raises WeightsError: a run of code that no commit holds, or one that started from weights of which nothing is known.
+    Raises WeightsError: a run of code that no commit holds.
     """
     for run in chain(recipe):
-        what, revision = _name(run), run.get("git_revision")
+        config, revision = run.get("config", {}), run.get("git_revision")
         if not COMMIT.fullmatch(str(revision)):
             raise WeightsError(
-                f"{weights}: {what} was trained at revision {revision}; commit first, so that it can be trained again"
-            )
-        config = run.get("config", {})
-        started_from = [config[key] for key in ("start", "encoder_from") if config.get(key)]
-        if len(run.get("origins") or ()) < len(started_from):
-            raise WeightsError(
-                f"{weights}: {what} started from {', '.join(started_from)}, of which its recipe says nothing; "
-                "train it again with this version"
+                f"{weights}: a run on {_data(config)} is of revision {revision}; commit first, to be able to repeat it"
             )
 
 
@@ -206,21 +199,14 @@ def _run_table(recipe: dict[str, Any]) -> list[str]:
     return _markdown(rows)
 
 
-def _sources(figure: dict[str, Any]) -> str:
-    """Which views the figures are of; files of before say `baseline`, and had no image of the query's own."""
-    if "sources" not in figure:
-        return f"baseline `{figure['baseline']}`"
-    return f"sources `{figure['sources']}`" + (" with the query's own image" if figure["own_image"] else "")
-
-
 def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
     if not figures:
         return ["Nothing was measured."]
     first = figures[0]
-    of_what = "these float16 weights" if first.get("measured") else "the float32 weights that these were made of"
+    own = " with the query's own image" if first["own_image"] else ""
     title = (
-        f"Measured with {of_what} on {first['rooms']} rooms of the {first['split']} split, {first['images']} images, "
-        f"protocol `{first['protocol']}`, {first['views']} views, {_sources(first)}:"
+        f"Measured with these weights on {first['rooms']} rooms of the {first['split']} split, {first['images']}"
+        f" images, protocol `{first['protocol']}`, {first['views']} views, sources `{first['sources']}`{own}:"
     )
     rows = [("", *("sensor depth" if figure["depth"] == "on" else "no depth" for figure in figures))]
     for name, key in (("mIoU", "miou"), ("total accuracy", "total_accuracy"), ("average accuracy", "average_accuracy")):
@@ -228,19 +214,12 @@ def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
     rows.append(("calibration error", *(_percent(figure.get("ece")) for figure in figures)))
     rows.append(("agreement of neighbouring views", *(_percent(figure.get("consistency")) for figure in figures)))
     rows.append(("depth, relative error", *(_percent(figure.get("depth_abs_rel")) for figure in figures)))
-    rows.append(("PSNR, dB", *(_number(figure.get("psnr_db"), 1) for figure in figures)))
-    rows.append(("SSIM", *(_number(figure.get("ssim"), 3) for figure in figures)))
     return [title, "", *_markdown(rows)]
 
 
 def _markdown(rows: Sequence[tuple[str, ...]]) -> list[str]:
     lines = [f"| {' | '.join(row)} |" for row in rows]
     return [lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]
-
-
-def _name(run: dict[str, Any]) -> str:
-    config = run.get("config", {})
-    return f"the run of {config.get('kind', 'unknown kind')} on {_data(config)}"
 
 
 def _data(config: dict[str, Any]) -> str:
@@ -257,10 +236,6 @@ def _depth(config: dict[str, Any]) -> str:
 
 def _count(number: float | None) -> str:
     return "-" if number is None else f"{number:,.0f}"
-
-
-def _number(number: float | None, digits: int) -> str:
-    return "-" if number is None else f"{number:.{digits}f}"
 
 
 def _percent(share: float | None) -> str:

@@ -16,7 +16,6 @@ from semantic_mapper.labels import ROOMS, make_label_set
 from tests.small import tiny_field
 
 COMMIT = "a" * 40
-UNKNOWN_START = {"kind": "sray", "start": "", "encoder_from": "weights.safetensors"}
 
 
 def run(revision: str | None = COMMIT, **more: Any) -> dict[str, Any]:
