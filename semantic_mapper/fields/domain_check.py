@@ -77,5 +77,5 @@ def backbone_digests(weights: WeightsFile) -> set[str]:
     for name, tensor in sorted(weights.tensors.items()):
         network, backbone, _ = name.partition(".backbone.")
         if backbone:
-            found.setdefault(network, hashlib.sha256()).update(np.ascontiguousarray(tensor).tobytes())
+            found.setdefault(network, hashlib.sha256()).update((tensor + 0).tobytes())  # -0.0 is 0.0
     return {digest.hexdigest()[:32] for digest in found.values()}
