@@ -117,14 +117,14 @@ def load_weights(path: Path) -> WeightsFile:
     """Read a weights file.
     Raises WeightsError: missing, damaged, of another format or version, or weights that hold NaN."""
     tensors, metadata = open_weights(path)
+    if metadata.get("field") == MAP_KIND:
+        raise WeightsError(f"{path}: they refine saved maps (`refine --weights`) and label no frames")
     with refusing_damage(path):
         label_set = unpack_label_set(metadata["label_set"])
         recipe = json.loads(metadata["recipe"])
         msgspec.convert(recipe, _Recipe)
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
         kind = metadata["field"]
-        if kind == MAP_KIND:
-            raise ValueError("they refine saved maps (`refine --weights`) and label no frames")
         config = field_config(kind, json.loads(metadata["model_config"]))
     found = {n.removeprefix("model."): t for n, t in tensors.items() if n.startswith("model.")}
     return WeightsFile(kind, config, label_set, as_float32(found, path), anchors, recipe)
@@ -170,7 +170,8 @@ def open_weights(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():
-        near = nearest(path.name, sorted(file.name for file in path.parent.glob("*.safetensors")))
+        names = sorted(file.name for file in path.parent.glob("*.safetensors"))
+        near = nearest(path.name, names) if names else "; without one, the weights of the package are used"
         raise WeightsError(f"{path}: no such weights file{near}")
     try:
         with safe_open(path, framework="np") as stored:
