@@ -28,7 +28,7 @@ def shipped() -> Checkpoint:
 
 def scores(field: LearnedField, width: int) -> Scores:
     config = ValidationConfig(rooms=3, queries=2, rays=800, views=6)
-    pool = RoomPoolConfig(width=width, views=10, people=0.0, camera=CameraDraw(usual=1.0))  # they know no people
+    pool = RoomPoolConfig(width=width, views=10, people=0.0, camera=CameraDraw(usual=1.0))
     rooms = validation_rooms(config, pool, ALONE, torch.device("cpu"))
     return validate(field.eval(), rooms, config, TrainStepConfig(), ALONE)
 
@@ -50,12 +50,12 @@ def test_they_know_rooms_that_they_have_never_seen_with_depth_and_without(shippe
 def test_they_say_how_they_were_made_and_what_was_measured(shipped: Checkpoint):
     recipe = shipped.recipe
     assert re.fullmatch(r"[0-9a-f]{40}", recipe["git_revision"]), "a commit that holds all of the code"
-    assert isinstance(recipe["config"]["seed"], int)
+    trained = [run for run in chain(recipe) if "steps" in run]
+    assert len(trained) > 5 and all(isinstance(run["config"]["seed"], int) for run in trained)
     figures = {figure["depth"]: figure for figure in recipe["figures"]}
     assert all(figure["split"] == "test" and figure["rooms"] == 20 for figure in figures.values())
-    assert figures[True]["data_set"]["miou"] > 0.6
+    assert figures["on"]["data_set"]["miou"] > 0.6
     check_chain(default_checkpoint_path(), recipe)
-    assert sum(run["steps"] for run in chain(recipe)) > recipe["steps"], "with those of the runs that it started from"
 
 
 def test_the_model_card_says_what_the_file_says():
