@@ -298,7 +298,8 @@ def parted(
         if not PART_FREE <= free.sum() / max(1, (free | solid).sum()) < GONE_FREE or len(thing.voxels) > MOST_PARTED:
             continue
         xyz = thing.voxels.astype(np.float64) * size
-        free, _ = _states(other.snapshot, lie(xyz) / size, thing.class_id)
+        there = lie(xyz)
+        free, _ = _states(other.snapshot, there / size, thing.class_id)
         at, taken = np.flatnonzero(free), np.zeros(len(xyz), np.bool_)
         pairs = scipy.spatial.KDTree(xyz[at]).query_pairs(PART_GAP * size, output_type="ndarray")
         graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(at), len(at)))
@@ -308,12 +309,21 @@ def parted(
             part = _piece(thing, xyz, rows, up)
             filled = len(rows) * size**2 / float(np.sort(part.box.size)[1:].prod())
             whole = part.box.size.min() >= PART_SIDE_M and filled >= LEAST_FILLED
-            if whole and len(rows) <= MOST_PART * len(xyz):
+            if whole and len(rows) <= MOST_PART * len(xyz) and not stands(other, thing.class_id, there[rows]):
                 parts.append((part, k))
                 taken[rows] = True
         if taken.any():
             wholes[-1] = _piece(thing, xyz, np.flatnonzero(~taken), up)
     return wholes, parts
+
+
+def stands(visit: MapVisit, class_id: int, points: Float64) -> bool:
+    """Whether most of points (N, 3) lie so near to things of a class that they have not been moved."""
+    voxels = [thing.voxels for thing in visit.things if thing.class_id == class_id]
+    if not voxels:
+        return False
+    tree = scipy.spatial.KDTree(np.concatenate(voxels) * visit.snapshot.voxel_size_m)
+    return bool(np.mean(tree.query(points)[0] < LEAST_SHIFT_M) > 0.5)
 
 
 def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:

@@ -27,7 +27,7 @@ from semantic_mapper.queries.objects import (
     remember,
     visit_of,
 )
-from semantic_mapper.queries.revisit import Looks, MapVisit, touching
+from semantic_mapper.queries.revisit import Looks, MapVisit, stands, touching
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -121,6 +121,15 @@ def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
     seat, leg, other, far = (grid + np.array((x, 0, 0)) for x in (0.0, 0.13, 0.26, 0.6))
     assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
     assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
+
+
+def test_what_lies_along_a_thing_of_its_class_stands_where_it_stood() -> None:
+    house = visit(two_rooms(), 10)
+    (table,) = [t for t in house.things if t.class_name == "table"]
+    points = table.voxels.astype(np.float64) * VOXEL_M
+    nudged, away = (points + np.array(shift) for shift in ((0, 0, 0.04), (0, 2, 0)))
+    assert stands(house, table.class_id, nudged) and not stands(house, table.class_id, away)
+    assert not stands(house, LABELS.id_of("door"), points)
 
 
 def test_pieces_that_left_together_are_one_thing() -> None:
