@@ -46,7 +46,7 @@ def mean(paths: Sequence[Path]) -> Checkpoint:
     return Checkpoint(model, (), recipe | provenance(torch.device("cpu")))
 
 
-def main() -> int:
+def main() -> None:
     """Write the mean, as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path, metavar="W", nargs="+")
@@ -55,10 +55,8 @@ def main() -> int:
     try:
         save_checkpoint(mean(given.weights), given.out)
     except SemanticMapperError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

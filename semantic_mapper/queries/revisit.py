@@ -319,11 +319,16 @@ def parted(
 
 def stands(visit: MapVisit, class_id: int, points: Float64) -> bool:
     """Whether most of points (N, 3) lie so near to things of a class that they have not been moved."""
-    voxels = [thing.voxels for thing in visit.things if thing.class_id == class_id]
-    if not voxels:
+    size, low, high = (
+        visit.snapshot.voxel_size_m,
+        points.min(axis=0) - LEAST_SHIFT_M,
+        points.max(axis=0) + LEAST_SHIFT_M,
+    )
+    surfaces = [thing.voxels * size for thing in visit.things if thing.class_id == class_id]
+    near = [xyz[((xyz >= low) & (xyz <= high)).all(axis=1)] for xyz in surfaces]
+    if not any(map(len, near)):
         return False
-    tree = scipy.spatial.KDTree(np.concatenate(voxels) * visit.snapshot.voxel_size_m)
-    return bool(np.mean(tree.query(points)[0] < LEAST_SHIFT_M) > 0.5)
+    return bool(np.mean(scipy.spatial.KDTree(np.concatenate(near)).query(points)[0] < LEAST_SHIFT_M) > 0.5)
 
 
 def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
