@@ -45,7 +45,7 @@ from semantic_mapper.localization.relocalizer import (
     sighting,
 )
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.odometry_sessions import REMEMBERED
+from semantic_mapper.mapping.odometry_sessions import HELD, REMEMBERED
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.merge import merge_maps
 from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
@@ -63,7 +63,6 @@ KINDS = ("moved", "new", "gone")
 VISIT_NS = 86_400_000_000_000
 FRAME_NS = 66_666_667
 PROBES = 60  # points in a thing's box
-HELD = 30  # frames that a robot that starts in a room holds, at most, until it knows where it is
 SPREAD, MANY = 0.12, {Pattern.SPINES, Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE}  # of one colour; of many
 
 
@@ -163,7 +162,7 @@ def map_days(seed: int, own: bool, path: Path) -> None:
     home, rng = make_home(seed), np.random.default_rng((78, seed))
     same, later, true = next_day(home, seed, changes=False)[0], *next_day(home, seed)
     seen, counts = _Seen(true), np.zeros((2, len(home.rooms), 1 << 16), np.int64)
-    camera, heads, finder = camera_of_width(OWN_WIDTH if own else WIDTH), list[RoomView](), None
+    camera, starts, finder = camera_of_width(OWN_WIDTH if own else WIDTH), [list[RoomView]() for _ in home.rooms], None
     for day, rooms in enumerate((home, same, later)):
         mapper, errors = _Own() if own else Labelled(ROOMS), pose_errors(rng, len(home.rooms)) if day else ()
         for number, (room, view) in enumerate(visit(rooms, seed + 31 * day, FRAMES, camera, NoiseConfig(), errors)):
@@ -171,27 +170,28 @@ def map_days(seed: int, own: bool, path: Path) -> None:
                 seen.look(view, day // 2)
                 shown = np.bincount(view.rendered.instance.ravel(), minlength=1 << 16)
                 counts[day // 2, room] += shown >= LEAST_PIXELS
-            heads += [view] * (day == 2 and number % FRAMES < HELD)
+            starts[room] += [view] * (day == 2)
             mapper.add(replace(view.frame, stamp_ns=day * VISIT_NS + (number + 1) * FRAME_NS, seq=number))
         mapper.voxel_map.save(path.with_suffix(f".{day}.npz"))
         finder = finder or Relocalizer(mapper.voxel_map.places.places, mapper.voxel_map, ROOMS.ignore_id)
     assert finder is not None
-    starts = [find_start(finder, heads[k : k + HELD]) for k in range(0, len(heads), HELD)]
+    found = [find_start(finder, views) for views in starts]
     was, now = (list(things_of(*pair)) for pair in zip((home, later), counts, strict=True))
     stood = [(ROOMS.id_of(t.name), t.low, t.high) for t in was if t in now]
-    path.write_text(json.dumps({"truth": seen.truths(true), "stood": stood, "starts": starts}))
+    path.write_text(json.dumps({"truth": seen.truths(true), "stood": stood, "starts": found}))
 
 
 def find_start(finder: Relocalizer, views: Sequence[RoomView]) -> int:
-    """1 where a robot that starts with these views finds itself in a map, -1 where it does so wrongly, else 0."""
+    """By how many of these views a robot that starts with them has found itself in a map; less than 0 where it has
+    done so wrongly, and 0 where it has not."""
     seen = list[Sighting]()
-    for frame, T in ((view.frame, view.T_world_camera) for view in views):
+    for number, (frame, T) in enumerate(((view.frame, view.T_world_camera) for view in views), 1):
         found = finder.find(frame.rgb, frame.depth_m, frame.intrinsics)
         if isinstance(found, Relocalized):
             seen.append(sighting(found.T_map_camera, frame.T_world_camera))
         if not (consensus := find_consensus(seen[-REMEMBERED:])).refusal:
             off_m, off_rad = view_distances(agreed(consensus.agreeing) @ frame.T_world_camera, T)
-            return 1 if off_m <= WITHIN_M and off_rad <= np.radians(WITHIN_DEG) else -1
+            return number if off_m <= WITHIN_M and off_rad <= np.radians(WITHIN_DEG) else -number
     return 0
 
 
@@ -358,7 +358,10 @@ def main() -> None:
         print(f"home {seed}: {right} of {true} found, {reported - right} false; unchanged: {false[-1]}", flush=True)
     show(changed)
     print(f"unchanged: {sum(n > 0 for n in false)} of {len(false)} homes with a false change, {sum(false)} in all")
-    print(f"relocalised: {starts.count(1)} of {len(starts)} starts, {starts.count(-1)} wrong")
+    right, soon = (sum(0 < n <= most for n in starts) for most in (FRAMES, HELD))
+    print(
+        f"relocalised: {right} of {len(starts)} starts, {soon} within {HELD} frames, {sum(n < 0 for n in starts)} wrong"
+    )
     print(*(f"id kept: {ids[f'{kind} with id']} of {ids[kind]} that {kind}" for kind in ("stood", "moved")), sep="\n")
 
 

@@ -218,9 +218,9 @@ class ObjectMemory:
                 left.add(thing.id)
             elif thing.id not in left and missed[i]:
                 self._objects[thing.id] = replace(thing, missed=thing.missed + missed[i])
-        there = [o.surface for o in old if o.id in left]
+        there = [o.box for o in old if o.id in left]
         for part in taken:
-            if len(touching([part.surface, *there])) <= len(there):  # a part of what left
+            if len(touching([part.box, *there])) <= len(there):  # a part of what left
                 continue
             thing = self._with_id(part)
             self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=1)
@@ -251,7 +251,7 @@ class ObjectMemory:
             )
         left = [i for i, e in evidence.items() if old[i].class_name not in FIXTURES and e.free_of >= SHIFTED_FREE]
         whole = [i for i in left if evidence[i].free_of >= GONE_FREE]
-        for group in touching([old[i].surface for i in whole], [old[i].class_id for i in whole]):
+        for group in touching([old[i].box for i in whole], [old[i].class_id for i in whole]):
             first, *others = sorted((whole[k] for k in group), key=lambda i: -float(np.prod(old[i].box.size)))
             for i in others:
                 left.remove(i)
@@ -371,8 +371,9 @@ class ObjectMemory:
 def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:
     """Small things of which pieces came together as one each, and how much of the place of each was free."""
     whole = [j for j, f in enumerate(free) if f >= GONE_FREE]
-    points = [sample_points(now.things[j], now.snapshot) for j in whole]
-    groups = [[whole[k] for k in g] for g in touching(points, [now.things[j].class_id for j in whole]) if len(g) > 1]
+    things = [now.things[j] for j in whole]
+    pieces = touching([thing.box for thing in things], [thing.class_id for thing in things])
+    groups = [[whole[k] for k in g] for g in pieces if len(g) > 1]
     gone = {j for group in groups for j in group}
     kept = [j for j in range(len(free)) if j not in gone]
     ones = [joined([now.things[j] for j in group], now.snapshot.voxel_size_m) for group in groups]

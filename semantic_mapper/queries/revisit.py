@@ -20,7 +20,7 @@ from semantic_mapper.geometry import transform, turn_onto
 from semantic_mapper.localization.places import Place
 from semantic_mapper.mapping.blocks import find_sorted, pack_keys
 from semantic_mapper.mapping.changes import TSDF_STEPS, UNOBSERVED
-from semantic_mapper.queries.instances import OTHER, Instance, upright_box
+from semantic_mapper.queries.instances import OTHER, Instance, OrientedBox, upright_box
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import cast_rays, surface_voxels
@@ -340,16 +340,17 @@ def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
     return replace(thing, voxels=thing.voxels[rows], box=box, centroid=xyz[rows].mean(axis=0))
 
 
-def touching(points: Sequence[Float64], classes: Sequence[int] = ()) -> list[list[int]]:
-    """Groups of pieces, of points (N, 3), whose boxes touch; of one class, where classes are given."""
-    ends = [(p.min(axis=0) - TOUCH_M, p.max(axis=0)) for p in points]
+def touching(boxes: Sequence[OrientedBox], classes: Sequence[int] = ()) -> list[list[int]]:
+    """Groups of pieces whose boxes touch; of one class, where classes are given."""
+    reach = [np.abs(box.R_world_box) @ box.size / 2 for box in boxes]
+    ends = [(box.center - half - TOUCH_M, box.center + half) for box, half in zip(boxes, reach, strict=True)]
     groups: list[list[int]] = []
 
     def touch(k: int, m: int) -> bool:
         same = not classes or classes[k] == classes[m]
         return same and bool((ends[m][0] <= ends[k][1]).all() and (ends[k][0] <= ends[m][1]).all())
 
-    for k in range(len(points)):
+    for k in range(len(boxes)):
         near = [g for g in groups if any(touch(k, m) for m in g)]
         groups = [g for g in groups if g not in near] + [[*(m for g in near for m in g), k]]
     return groups
