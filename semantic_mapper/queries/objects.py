@@ -190,12 +190,10 @@ class ObjectMemory:
         for j, thing in enumerate(now.things):
             if j not in still and came_free[j] >= SHIFTED_FREE:
                 looks = signature_of(now.snapshot, thing, up), color_of(now.snapshot, thing)
-                center = points[j].mean(axis=0)
-                comers[j] = Candidate(thing.class_id, thing.box.size, center, came_free[j], *looks)
+                centers = np.stack((points[j].mean(axis=0), thing.box.center))
+                comers[j] = Candidate(thing.class_id, thing.box.size, centers, came_free[j], *looks)
         away = [o for o in self.objects if o.gone_ns is not None]
-        gone_before = (Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature, o.color) for o in away)
-        of_parts = (Candidate(o.class_id, o.box.size, o.box.center, 1.0, o.signature, o.color) for o in taken)
-        rows = [*goers.values(), *of_parts, *gone_before]
+        rows = [*goers.values(), *(_candidate(o, np.eye(4), 1.0) for o in (*taken, *away))]
         sources, targets = [*(old[i] for i in goers), *taken, *away], list(comers)
         left, came = set[int](), set[int]()
         for r, c, probability in match_candidates(rows, list(comers.values())):
@@ -258,12 +256,7 @@ class ObjectMemory:
                 del self._objects[old[i].id]
             if others:
                 old[first] = self._objects[old[first].id] = _as_one([old[i] for i in (first, *others)])
-        found = dict[int, Candidate]()
-        for i in left:
-            thing = old[i]
-            center = transform(fit.at(thing.box.center), thing.surface).mean(axis=0)
-            looks = thing.signature, thing.color
-            found[i] = Candidate(thing.class_id, thing.box.size, center, evidence[i].free_of, *looks)
+        found = {i: _candidate(old[i], fit.at(old[i].box.center), evidence[i].free_of) for i in left}
         return found, {i: e.looks for i, e in evidence.items()}
 
     def _came(self, now: MapVisit, before: MapVisit | None, fit: Fit) -> list[float]:
@@ -366,6 +359,12 @@ class ObjectMemory:
             )
             for thing in ordered[:excess]:
                 del self._objects[thing.id]
+
+
+def _candidate(thing: MapObject, T_now_then: Float64, free: float) -> Candidate:
+    """What was there and may be so no longer; ``free`` as of ``Candidate``."""
+    centers = transform(T_now_then, np.stack((thing.surface.mean(axis=0), thing.box.center)))
+    return Candidate(thing.class_id, thing.box.size, centers, free, thing.signature, thing.color)
 
 
 def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:

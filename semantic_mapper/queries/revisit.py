@@ -153,7 +153,7 @@ class Candidate(NamedTuple):
 
     class_id: int
     size: Float64  # (3,) of its box
-    center: Float64  # (3,) mean of its surface, in the world of now
+    centers: Float64  # (2, 3) mean of its surface and middle of its box, in the world of now
     free: float  # of what is known of its place in the other map
     signature: NDArray[np.int8]
     color: UInt8  # (3,)
@@ -164,7 +164,8 @@ def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) ->
     cost = np.full((len(goers), len(comers)), np.inf)
     for row, a in enumerate(goers):
         for column, b in enumerate(comers):
-            shift = float(np.linalg.norm(b.center - a.center))
+            # Of what is seen from another side the one or the other lies elsewhere.
+            shift = float(np.linalg.norm(b.centers - a.centers, axis=1).min())
             near = shift <= float(a.size.max()) and a.class_id == b.class_id
             if shift >= LEAST_SHIFT_M and (near or min(a.free, b.free) >= GONE_FREE):
                 cost[row, column] = pair_cost(a, b)
