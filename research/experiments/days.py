@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from research.experiments.put_things import map_frame, sees_through
-from research.experiments.relocalization import WITHIN_DEG, WITHIN_M
+from research.experiments.relocalization import WITHIN_DEG, WITHIN_M, lock
 from research.scenes.config import NoiseConfig
 from research.scenes.days import SHELL, TEMPLATES, DayChange, Home, make_home, next_day, pose_errors, visit
 from research.scenes.materials import Pattern
@@ -36,16 +36,9 @@ from semantic_mapper.geometry import unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.localization.features import find_place_features
 from semantic_mapper.localization.places import MAX_FEATURES, make_place, view_distances
-from semantic_mapper.localization.relocalizer import (
-    Relocalized,
-    Relocalizer,
-    Sighting,
-    agreed,
-    find_consensus,
-    sighting,
-)
+from semantic_mapper.localization.relocalizer import Relocalized, Relocalizer, sighting
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.odometry_sessions import HELD, REMEMBERED
+from semantic_mapper.mapping.odometry_sessions import HELD
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.merge import merge_maps
 from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
@@ -146,7 +139,7 @@ class Labelled:
             self.voxel_map.places.add(make_place(frame.camera_id, frame.stamp_ns, T, features, k))
 
 
-class _Own:
+class OwnLabels:
     """A map of S-Ray's labels."""
 
     def __init__(self) -> None:
@@ -154,6 +147,7 @@ class _Own:
         self.voxel_map = self.pipeline.voxel_map
 
     def add(self, frame: PosedFrame) -> None:
+        """Fuse a frame."""
         self.pipeline.step(replace(frame, label=None))
 
 
@@ -164,7 +158,7 @@ def map_days(seed: int, own: bool, path: Path) -> None:
     seen, counts = _Seen(true), np.zeros((2, len(home.rooms), 1 << 16), np.int64)
     camera, starts, finder = camera_of_width(OWN_WIDTH if own else WIDTH), [list[RoomView]() for _ in home.rooms], None
     for day, rooms in enumerate((home, same, later)):
-        mapper, errors = _Own() if own else Labelled(ROOMS), pose_errors(rng, len(home.rooms)) if day else ()
+        mapper, errors = OwnLabels() if own else Labelled(ROOMS), pose_errors(rng, len(home.rooms)) if day else ()
         for number, (room, view) in enumerate(visit(rooms, seed + 31 * day, FRAMES, camera, NoiseConfig(), errors)):
             if day != 1:
                 seen.look(view, day // 2)
@@ -184,15 +178,17 @@ def map_days(seed: int, own: bool, path: Path) -> None:
 def find_start(finder: Relocalizer, views: Sequence[RoomView]) -> int:
     """By how many of these views a robot that starts with them has found itself in a map; less than 0 where it has
     done so wrongly, and 0 where it has not."""
-    seen = list[Sighting]()
-    for number, (frame, T) in enumerate(((view.frame, view.T_world_camera) for view in views), 1):
-        found = finder.find(frame.rgb, frame.depth_m, frame.intrinsics)
-        if isinstance(found, Relocalized):
-            seen.append(sighting(found.T_map_camera, frame.T_world_camera))
-        if not (consensus := find_consensus(seen[-REMEMBERED:])).refusal:
-            off_m, off_rad = view_distances(agreed(consensus.agreeing) @ frame.T_world_camera, T)
-            return number if off_m <= WITHIN_M and off_rad <= np.radians(WITHIN_DEG) else -number
-    return 0
+    looks = (finder.find(v.frame.rgb, v.frame.depth_m, v.frame.intrinsics) for v in views)
+    found = lock(
+        sighting(look.T_map_camera, view.frame.T_world_camera) if isinstance(look, Relocalized) else None
+        for view, look in zip(views, looks, strict=True)
+    )
+    if found is None:
+        return 0
+    number, T_map_world = found
+    frame, T = views[number - 1].frame, views[number - 1].T_world_camera
+    off_m, off_rad = view_distances(T_map_world @ frame.T_world_camera, T)
+    return number if off_m <= WITHIN_M and off_rad <= np.radians(WITHIN_DEG) else -number
 
 
 def things_of(home: Home, counts: np.ndarray) -> Iterator[Thing]:
@@ -263,8 +259,8 @@ def near(found: OrientedBox, box: Any) -> bool:
     return bool(np.linalg.norm(found.center - (low + high) / 2) < limit)
 
 
-def judge(reports: Sequence[Report], truth: Sequence[Truth], say: bool) -> Score:
-    """Compare reports with the truth."""
+def judge(reports: Sequence[Report], truth: Sequence[Truth], say: bool) -> tuple[Score, list[Truth]]:
+    """Compare reports with the truth; and what of it is not found."""
     score, left, wrong = Score(Counter(), Counter(), Counter()), list(truth), list[Report]()
     score.true.update(_kind(t) for t in truth if t.counts and t.kind != "swapped")
     for report in reports:
@@ -290,7 +286,16 @@ def judge(reports: Sequence[Report], truth: Sequence[Truth], say: bool) -> Score
         if say and t.counts and t.kind != "swapped":
             name = ROOMS.names[ROOMS.ids.index(t.label)]
             print("   missed", t.kind, name, *(np.mean(b, axis=0).round(2) for b in (t.before, t.after) if b))
-    return score
+    return score, left
+
+
+def is_hidden(change: Truth, *visits: MapVisit) -> bool:
+    """Whether at least one of both visits saw less than half of a thing's outside."""
+    for visit_, box in zip(visits, (change.before, change.after), strict=True):
+        there = [t.seen for t in visit_.things if box and t.class_id == change.label and near(t.box, box)]
+        if box and max(there, default=0) < 0.5:
+            return True
+    return False
 
 
 def _kind(truth: Truth) -> str:
@@ -342,7 +347,7 @@ def main() -> None:
     parser.add_argument("--say", action="store_true", help="name each error")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    changed, false, starts, ids = list[Score](), list[int](), list[int](), Counter[str]()
+    changed, false, starts, ids, hard = list[Score](), list[int](), list[int](), Counter[str](), Counter[str]()
     for seed in SPLITS[arguments.split][: arguments.homes]:
         path = arguments.out / f"{seed}{'-own' if arguments.own else ''}.json"
         if not path.exists():
@@ -350,13 +355,23 @@ def main() -> None:
         rows = json.loads(path.read_text())
         truth, files = [Truth(*row) for row in rows["truth"]], [path.with_suffix(f".{day}.npz") for day in range(3)]
         first, same, later = (visit_of(VoxelMap.load(file)) for file in files)
-        changed.append(judge(compare(first, later), truth, arguments.say))
-        false.append(judge(compare(first, same), [], arguments.say).reported.total())
+        reports = compare(first, later)
+        score, missed = judge(reports, truth, arguments.say)
+        changed.append(score)
+        false.append(judge(compare(first, same), [], arguments.say)[0].reported.total())
+        for t in truth:
+            if t.kind == "swapped":
+                hard["swapped"] += 1
+                hard["swapped found"] += any(r.after is not None and near(r.after, t.after) for r in reports)
+            for name in ("half hidden",) * is_hidden(t, first, later) + ("moved 10 cm",) * (t.kind == "nudged"):
+                hard[name] += t.counts and t.kind != "swapped"
+                hard[f"{name} found"] += t.counts and t not in missed
         starts += rows["starts"]
         ids += kept(files, rows["stood"], truth, arguments.out)
         right, reported, true = (getattr(changed[-1], name).total() for name in Score._fields)
         print(f"home {seed}: {right} of {true} found, {reported - right} false; unchanged: {false[-1]}", flush=True)
     show(changed)
+    print(*(f"{n}: {hard[f'{n} found']} of {hard[n]}" for n in ("half hidden", "moved 10 cm", "swapped")), sep="; ")
     print(f"unchanged: {sum(n > 0 for n in false)} of {len(false)} homes with a false change, {sum(false)} in all")
     right, soon = (sum(0 < n <= most for n in starts) for most in (FRAMES, HELD))
     print(

@@ -1,6 +1,6 @@
 """Are the first answers to generated phrases right? Homes of ``scenes.days``, one visit, true labels.
 
-    python -m research.experiments.find --split test
+    python -m research.experiments.find --split test          # --own: labels of S-Ray instead of the true ones
     python -m research.experiments.find --split test --mcp    # 20 things in 3 homes, by the MCP SDK's own client
 
 A phrase has a class or a synonym and one to three of: colour, size, room, a relation; at most half of the things of its
@@ -24,14 +24,24 @@ import anyio
 import numpy as np
 from mcp import Client, StdioServerParameters, stdio_client
 
-from research.experiments.days import FRAME_NS, FRAMES, LEAST_PIXELS, SPLITS, VISIT_NS, WIDTH, Thing, near, things_of
-from research.experiments.put_things import map_frame
+from research.experiments.days import (
+    FRAME_NS,
+    FRAMES,
+    LEAST_PIXELS,
+    OWN_WIDTH,
+    SPLITS,
+    VISIT_NS,
+    WIDTH,
+    Labelled,
+    OwnLabels,
+    Thing,
+    near,
+    things_of,
+)
 from research.scenes.config import NoiseConfig
 from research.scenes.days import make_home, visit
 from research.suites.config import camera_of_width
-from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.find import FoundObject, find, open_objects
 from semantic_mapper.queries.instances import OrientedBox
 from semantic_mapper.queries.objects import remember
@@ -46,17 +56,17 @@ Judged = bool | None  # None = unclear
 Condition = tuple[str, str, Callable[[Thing], Judged]]  # words before the noun, behind it, and whether it is so
 
 
-def make(seed: int, folder: Path) -> None:
+def make(seed: int, own: bool, path: Path) -> None:
     """Map a home and write its map and its things."""
-    home, voxel_map = make_home(seed), VoxelMap(VoxelMapConfig(), ROOMS)
+    home, mapper = make_home(seed), OwnLabels() if own else Labelled(ROOMS)
     counts = np.zeros((len(home.rooms), 1 << 16), np.int64)
-    views = visit(home, seed, FRAMES, camera_of_width(WIDTH), NoiseConfig())
+    views = visit(home, seed, FRAMES, camera_of_width(OWN_WIDTH if own else WIDTH), NoiseConfig())
     for number, (room, view) in enumerate(views):
-        map_frame(voxel_map, replace(view.frame, stamp_ns=20_000 * VISIT_NS + number * FRAME_NS, seq=number))
+        mapper.add(replace(view.frame, stamp_ns=20_000 * VISIT_NS + number * FRAME_NS, seq=number))
         counts[room] += np.bincount(view.rendered.instance.ravel(), minlength=1 << 16) >= LEAST_PIXELS
-    assert remember(voxel_map) is not None
-    (folder / f"{seed}.json").write_text(json.dumps(list(things_of(home, counts))))
-    voxel_map.save(folder / f"{seed}.npz")
+    assert remember(mapper.voxel_map) is not None
+    path.with_suffix(".json").write_text(json.dumps(list(things_of(home, counts))))
+    mapper.voxel_map.save(path)
 
 
 def color_of(thing: Thing) -> str | None:
@@ -175,19 +185,19 @@ def main() -> None:
     """Map what is missing, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--split", choices=tuple(SPLITS), default="tune")
+    parser.add_argument("--homes", type=int, default=20)
     parser.add_argument("--phrases", type=int, default=200)
-    parser.add_argument(
-        "--out", type=Path, default=Path("runs/find"), help="maps of homes; made where they are missing"
-    )
+    parser.add_argument("--own", action="store_true", help="labels of S-Ray")
+    parser.add_argument("--out", type=Path, default=Path("runs/find"), help="maps; made where they are missing")
     parser.add_argument("--mcp", action="store_true", help="ask for 20 things in 3 homes, as an agent does")
     parser.add_argument("--say", action="store_true", help="name each phrase whose first answer is wrong")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    ranks, alone, seeds = list[int](), list[int](), SPLITS[arguments.split][: 3 if arguments.mcp else None]
+    ranks, alone, seeds = list[int](), list[int](), SPLITS[arguments.split][: 3 if arguments.mcp else arguments.homes]
     for seed in seeds:
-        path = arguments.out / f"{seed}.npz"
+        path = arguments.out / f"{seed}{'-own' if arguments.own else ''}.npz"
         if not path.exists():
-            make(seed, arguments.out)
+            make(seed, arguments.own, path)
         things = [Thing(*row) for row in json.loads(path.with_suffix(".json").read_text())]
         if arguments.mcp:
             asked = list(phrases(things, 7 if seed < seeds[2] else 6, np.random.default_rng((49, seed))))

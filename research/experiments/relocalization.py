@@ -104,23 +104,25 @@ def look_for(mapped: Mapped, frame: PosedFrame, truth: Float64 | None) -> dict[s
     return row
 
 
+def lock(seen: Iterable[Sighting | None]) -> tuple[int, Float64] | None:
+    """By how many frames, found or not (None), enough agree on where their world is in the map; and T_map_world."""
+    found = list[Sighting]()
+    for number, one in enumerate(seen, 1):
+        found += [] if one is None else [one]
+        if not (consensus := find_consensus(found[-REMEMBERED:])).refusal:
+            return number, agreed(consensus.agreeing)
+    return None
+
+
 def locked_in(rows: list[dict[str, Any]], frames: list[PosedFrame]) -> dict[str, Any]:
     """How far off a mapper would lock in the world of a camera that starts at any of these frames."""
     seen = [
         sighting(np.array(row["T_map_camera"]), frame.T_world_camera) if row["found"] else None
         for row, frame in zip(rows, frames, strict=True)
     ]
-    errors: list[float] = []
-    for start in range(len(seen)):
-        found: list[Sighting] = []
-        for one in filter(None, seen[start:]):
-            found.append(one)
-            consensus = find_consensus(found[-REMEMBERED:])
-            if not consensus.refusal:
-                ahead = np.array([f.T_world_camera @ (0, 0, AHEAD_M, 1) for f in frames])
-                off = np.linalg.norm((ahead @ agreed(consensus.agreeing).T - ahead)[:, :3], axis=1)
-                errors.append(float(np.median(off)))
-                break
+    ahead, errors = np.array([f.T_world_camera @ (0, 0, AHEAD_M, 1) for f in frames]), list[float]()
+    for _, T_map_world in filter(None, (lock(seen[start:]) for start in range(len(seen)))):
+        errors.append(float(np.median(np.linalg.norm((ahead @ T_map_world.T - ahead)[:, :3], axis=1))))
     p50, p95, worst = np.percentile(errors, (50, 95, 100)).round(4).tolist()
     return {"starts": len(errors), "ahead_m_p50": p50, "ahead_m_p95": p95, "ahead_m_worst": worst}
 
@@ -138,12 +140,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
     off = np.array([(r["off_m"], r["off_deg"]) for r in found if "off_m" in r]).reshape(-1, 2)
     if len(off):
-        told |= {
-            "median_m": float(np.median(off[:, 0])),
-            "median_deg": float(np.median(off[:, 1])),
-            "p95_m": float(np.percentile(off[:, 0], 95)),
-            "p95_deg": float(np.percentile(off[:, 1], 95)),
-        }
+        for name, of in (("median", 50), ("p95", 95)):
+            told |= dict(zip((f"{name}_m", f"{name}_deg"), np.percentile(off, of, axis=0).tolist(), strict=True))
     return told
 
 

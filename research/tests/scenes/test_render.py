@@ -7,15 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from research.scenes import CameraPathConfig, RoomConfig, Scene, camera_path, make_room, render_view
+from research.scenes import CameraPathConfig, RoomConfig, camera_path, make_room, render_view
 from research.scenes.camera import pose_of
 from research.scenes.fast_cast import cast_pixels
-from research.scenes.materials import MaterialTable, Pattern
-from research.scenes.primitives import Primitives, Shape
-from research.scenes.scene import Lights, extremes, shadow_cubes
+from research.scenes.primitives import Shape
 from research.scenes.sensor_depth import depth_edges
 from semantic_mapper.errors import PoseError
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(fx=66.0, fy=66.0, cx=47.5, cy=35.5, width=96, height=72)
@@ -44,34 +41,6 @@ def test_a_primitive_ahead_is_hit_at_its_near_face(shape: Shape) -> None:
 def test_a_frustum_is_narrower_at_its_top_than_at_its_foot() -> None:
     # Half way up its radius is 0.8 of the half extent.
     assert middle_depth(Shape.FRUSTUM, (0.5, 0.25, 0.25)) == pytest.approx(3 - 0.8 * 0.5, abs=1e-6)
-
-
-COMPARED = (1, 2, 10, 14)
-
-
-def mirror_room() -> Scene:
-    """A mirror at x = 2 that fills the view of a camera at the origin, and a red box behind the camera."""
-    wall, prop = (ROOMS.ids[ROOMS.names.index(name)] for name in ("otherfurniture", "otherprop"))
-    one = np.ones(2)
-    primitives = Primitives(
-        shape=np.zeros(2, np.int64),
-        center=np.array([[2.05, 0.0, 0.0], [-2.0, 0.0, 0.0]]),
-        half=np.array([[0.05, 3.0, 3.0], [0.5, 0.4, 0.4]]),
-        rotation=np.stack((np.eye(3), np.eye(3))),
-        label=np.array([wall, prop], np.uint8),
-        instance=np.array([1, 2], np.uint16),
-        group=np.array([6, 7]),
-        material=np.arange(2),
-        casts_shadow=np.ones(2, np.bool_),
-    )
-    colors = np.array([[0.0, 0.0, 0.3], [0.8, 0.0, 0.0]])
-    materials = MaterialTable(
-        np.full(2, int(Pattern.PLAIN)), colors, colors, one, np.arange(2), 0 * one, 0 * one, np.array([0.9, 0.0])
-    )
-    position = np.array([[0.0, 0.0, 1.0]])
-    cubes = shadow_cubes(primitives, position, 16)
-    lights = Lights(position, np.ones((1, 3)), cubes, *extremes(cubes), np.array([0.5]), np.full(3, 0.5))
-    return Scene(0, "test", (4.0, 4.0, 3.0), primitives, materials, lights)
 
 
 @pytest.mark.parametrize("seed", [0, 3])
