@@ -17,7 +17,7 @@ from semantic_mapper.geometry import invert_pose, yaw_transform
 from semantic_mapper.localization.places import DESCRIPTOR_BYTES, Place
 from semantic_mapper.mapping.blocks import unpack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.instances import InstanceTracker, OrientedBox
 from semantic_mapper.queries.objects import (
     MAX_OBJECTS,
     MAX_PLACES,
@@ -27,7 +27,7 @@ from semantic_mapper.queries.objects import (
     remember,
     visit_of,
 )
-from semantic_mapper.queries.revisit import Looks, MapVisit, stands, touching
+from semantic_mapper.queries.revisit import Candidate, Looks, MapVisit, match_candidates, stands, touching
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -117,10 +117,21 @@ def test_what_was_brought_back_is_what_was_taken_away() -> None:
 
 
 def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
-    grid = np.stack(np.meshgrid(*[np.linspace(0, 0.1, 3)] * 3), axis=-1).reshape(-1, 3)
-    seat, leg, other, far = (grid + np.array((x, 0, 0)) for x in (0.0, 0.13, 0.26, 0.6))
+    turned, size = yaw_transform(np.zeros(3), 90)[:3, :3], np.array((0.2, 0.1, 0.1))  # 0.1 along x
+    seat, leg, other, far = (OrientedBox(np.array((x, 0, 0)), size, turned) for x in (0.0, 0.13, 0.26, 0.6))
     assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
     assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
+
+
+def test_a_thing_seen_from_another_side_has_not_moved() -> None:
+    signature = np.repeat(np.array((16, 37, 32), np.int8), (64, 12, 16))  # each histogram of unit length
+
+    def seen(surface: float, box: float) -> Candidate:
+        centers = np.array(((surface, 0, 0), (box, 0, 0)))
+        return Candidate(5, np.full(3, 0.4), centers, 0.9, signature, np.zeros(3, np.uint8))
+
+    assert not match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.01)])
+    assert [pair[:2] for pair in match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.1)])] == [(0, 0)]
 
 
 def test_what_lies_along_a_thing_of_its_class_stands_where_it_stood() -> None:
