@@ -24,7 +24,6 @@ from semantic_mapper.queries.instances import OrientedBox, upright_box
 from semantic_mapper.queries.revisit import (
     FIXTURES,
     GONE_FREE,
-    LEAST_VOXELS,
     SHIFTED_FREE,
     SIGNATURE,
     Candidate,
@@ -35,7 +34,9 @@ from semantic_mapper.queries.revisit import (
     color_of,
     find_evidence,
     joined,
+    lies_along,
     match_candidates,
+    may_go,
     overlapping,
     parted,
     sample_points,
@@ -184,8 +185,14 @@ class ObjectMemory:
         points = [sample_points(thing, now.snapshot) for thing in now.things]
         same = overlapping([o.surface for o in old], points, lambda i, j: old[i].class_id == now.things[j].class_id)
         goers, missed = self._goers(old, now, fit)
+        stood = {
+            (i, j)
+            for i, j in same
+            if i in goers and lies_along(transform(fit.at(old[i].box.center), old[i].surface), points[j])
+        }
+        goers = {i: goer for i, goer in goers.items() if all(i != k for k, _ in stood)}
         began = stamp_ns if before is None else before.stamp_ns
-        still = {j for i, j in same if before is None or old[i].places[-1].stamp_ns > began}
+        still = {j for i, j in same if before is None or (i, j) in stood or old[i].places[-1].stamp_ns > began}
         comers = dict[int, Candidate]()
         for j, thing in enumerate(now.things):
             if j not in still and came_free[j] >= SHIFTED_FREE:
@@ -241,7 +248,7 @@ class ObjectMemory:
         Pieces that left together are one object from now on, also in ``old``, with the id of the largest."""
         evidence = dict[int, Evidence]()
         for i, thing in enumerate(old):
-            if len(thing.points) < LEAST_VOXELS:
+            if not may_go(thing.box, len(thing.points)):
                 continue
             T = partial(fit.at, thing.box.center)
             evidence[i] = find_evidence(
@@ -264,7 +271,7 @@ class ObjectMemory:
         free = list[float]()
         for thing in now.things:
             points = sample_points(thing, now.snapshot)
-            if before is None or thing.class_name in FIXTURES or len(thing.voxels) < LEAST_VOXELS:
+            if before is None or thing.class_name in FIXTURES or not may_go(thing.box, len(thing.voxels)):
                 free.append(0.0 if before is not None else 1.0)
                 continue
             T = partial(fit.at, points.mean(axis=0))

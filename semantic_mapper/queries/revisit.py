@@ -36,7 +36,9 @@ GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is f
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
 LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
-LEAST_VOXELS = 40  # of a thing that may have left or come: less is often noise
+LEAST_VOXELS, SLIVER_M = 40, (0.03, 0.1)  # of a thing that may have left or come: what has less, or whose two
+# shorter sides are shorter, is often noise
+STANDS = 0.9  # of either of two surfaces that lies at the other one: they are of one thing that stood
 COMPARED = 400  # surface voxels of a thing, at most
 LOOKS = 12  # views of a place that are called whether they see through it
 LEAST_LOOKS = 2
@@ -391,10 +393,25 @@ def overlapping(
     return found
 
 
-def _reach(tree: Any) -> float:
+def _reach(tree: Any, least_m: float = NEAR_M) -> float:
     """How far points of the same surface may lie from the points of a tree, metres."""
     spacing = tree.query(tree.data, 2)[0][:, 1] if tree.n > 1 else np.zeros(1)
-    return max(NEAR_M, 1.2 * float(np.median(spacing)))
+    return max(least_m, 1.2 * float(np.median(spacing)))
+
+
+def lies_along(before: Float64, now: Float64) -> bool:
+    """Whether of two surfaces, points (N, 3), one is a part of the other: a thing that was seen in part has not moved."""
+    one, other = scipy.spatial.KDTree(before), scipy.spatial.KDTree(now)
+    within = (
+        np.mean(tree.query(points)[0] < _reach(tree, LEAST_SHIFT_M)) for tree, points in ((one, now), (other, before))
+    )
+    return bool(max(within) > STANDS)
+
+
+def may_go(box: OrientedBox, voxels: int) -> bool:
+    """Whether a thing, or what is kept of it, is large enough to be called gone or new."""
+    sides = np.sort(box.size)
+    return voxels >= LEAST_VOXELS and bool((sides[:2] >= SLIVER_M).any())
 
 
 class Fit:
