@@ -185,14 +185,14 @@ class ObjectMemory:
         points = [sample_points(thing, now.snapshot) for thing in now.things]
         same = overlapping([o.surface for o in old], points, lambda i, j: old[i].class_id == now.things[j].class_id)
         goers, missed = self._goers(old, now, fit)
-        stood = {
-            (i, j)
-            for i, j in same
-            if i in goers and lies_along(transform(fit.at(old[i].box.center), old[i].surface), points[j])
-        }
-        goers = {i: goer for i, goer in goers.items() if all(i != k for k, _ in stood)}
         began = stamp_ns if before is None else before.stamp_ns
-        still = {j for i, j in same if before is None or (i, j) in stood or old[i].places[-1].stamp_ns > began}
+        still = {j for i, j in same if before is None or old[i].places[-1].stamp_ns > began}
+        for i in tuple(goers):
+            surface = transform(fit.at(old[i].box.center), old[i].surface)
+            kin = [j for j, t in enumerate(now.things) if t.class_id == old[i].class_id and came_free[j] < GONE_FREE]
+            if stood := {j for j in kin if lies_along(surface, points[j])}:
+                still |= stood
+                del goers[i]
         comers = dict[int, Candidate]()
         for j, thing in enumerate(now.things):
             if j not in still and came_free[j] >= SHIFTED_FREE:

@@ -35,6 +35,7 @@ OTHER_CLASS, LEAST_SCORE = 0.5, 0.06  # how well two things overlap: less so of 
 GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is free is not there
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
+BY_GRID = 0.77  # weight of free voxels where no view sees through: next to thin boards they are free, too
 LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
 LEAST_VOXELS, SLIVER_M = 40, (0.03, 0.1)  # of a thing that may have left or come: what has less, or whose two
 # shorter sides are shorter, is often noise
@@ -145,9 +146,11 @@ class Evidence(NamedTuple):
 
     @property
     def free_of(self) -> float:
-        """Fraction free of those known; 0 where too few are."""
+        """Fraction free of those known, less where no view sees through them; 0 where too few are known."""
         known = int((self.free | self.solid).sum())
-        return float(self.free.sum() / known) if known >= LEAST_KNOWN * len(self.free) else 0.0
+        if known < LEAST_KNOWN * len(self.free):
+            return 0.0
+        return float(self.free.sum() / known) * (1.0 if self.looks else BY_GRID)
 
 
 class Candidate(NamedTuple):
@@ -400,7 +403,7 @@ def _reach(tree: Any, least_m: float = NEAR_M) -> float:
 
 
 def lies_along(before: Float64, now: Float64) -> bool:
-    """Whether of two surfaces, points (N, 3), one is a part of the other: a thing that was seen in part has not moved."""
+    """Whether of two surfaces, points (N, 3), one lies at the other: what was seen in part has not moved."""
     one, other = scipy.spatial.KDTree(before), scipy.spatial.KDTree(now)
     within = (
         np.mean(tree.query(points)[0] < _reach(tree, LEAST_SHIFT_M)) for tree, points in ((one, now), (other, before))

@@ -27,7 +27,18 @@ from semantic_mapper.queries.objects import (
     remember,
     visit_of,
 )
-from semantic_mapper.queries.revisit import Candidate, Looks, MapVisit, match_candidates, stands, touching
+from semantic_mapper.queries.revisit import (
+    GONE_FREE,
+    Candidate,
+    Evidence,
+    Looks,
+    MapVisit,
+    lies_along,
+    match_candidates,
+    may_go,
+    stands,
+    touching,
+)
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import Float64
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -132,6 +143,25 @@ def test_a_thing_seen_from_another_side_has_not_moved() -> None:
 
     assert not match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.01)])
     assert [pair[:2] for pair in match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.1)])] == [(0, 0)]
+
+
+def test_a_part_of_a_surface_lies_along_it_and_one_moved_by_10_cm_does_not() -> None:
+    faces = np.stack(np.meshgrid(*[np.linspace(0, 0.3, 11)] * 3), axis=-1).reshape(-1, 3)
+    shell = faces[((faces < 0.001) | (faces > 0.299)).any(axis=1)]
+    assert lies_along(shell, shell[shell[:, 0] < 0.1]) and lies_along(shell[shell[:, 0] < 0.1], shell)
+    assert not lies_along(shell, shell + np.array((0.1, 0, 0)))
+
+
+def test_a_sliver_and_a_speck_are_never_called_gone() -> None:
+    boxes = [OrientedBox(np.zeros(3), np.array(size), np.eye(3)) for size in ((0.5, 0.06, 0.02), (0.07, 0.07, 0.25))]
+    assert [may_go(box, 60) for box in boxes] == [False, True] and not may_go(boxes[1], 39)
+
+
+def test_what_only_the_grid_calls_free_counts_less_than_what_a_view_sees_through() -> None:
+    free = np.arange(10) < 8
+    assert Evidence(free, ~free, 2).free_of == pytest.approx(0.8)
+    assert Evidence(free, ~free, 0).free_of < GONE_FREE < 0.8
+    assert Evidence(free & False, np.arange(10) < 2, 2).free_of == 0  # too little is known
 
 
 def test_what_lies_along_a_thing_of_its_class_stands_where_it_stood() -> None:
