@@ -43,11 +43,10 @@ PACKAGES = {
 
 # Run in a child, since a library once loaded stays loaded. LD_LIBRARY_PATH holds FOLDER.
 PROBE = """
-import ctypes, importlib.util, pathlib, sys
-usb = importlib.util.find_spec("libusb_package")
-if usb is not None:
-    import libusb_package
-    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+import ctypes, importlib, importlib.util, pathlib
+usb = importlib.util.find_spec("libusb_package") and importlib.import_module("libusb_package").get_library_path()
+if usb:  # where it was built from source, it has none
+    ctypes.CDLL(str(usb), mode=ctypes.RTLD_GLOBAL)
 root = pathlib.Path(importlib.util.find_spec("open3d").origin).parent
 for pattern in ("libOpen3D.so*", "pybind*.so", "cpu/pybind*.so"):
     for path in sorted(root.glob(pattern)):

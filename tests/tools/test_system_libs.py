@@ -28,6 +28,16 @@ def test_open3d_loads_after_set_up(script: ModuleType) -> None:
     assert script.first_missing() is None
 
 
+def test_a_libusb_package_without_a_library_is_as_none(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "libusb_package.py").write_text("def get_library_path():\n    return None\n")
+    (tmp_path / "open3d").mkdir()
+    (tmp_path / "open3d" / "__init__.py").touch()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert script.first_missing() is None  # this open3d links nothing
+
+
 def test_every_library_that_open3d_reaches_has_a_known_package(script: ModuleType) -> None:
     if not shutil.which("ldd"):
         pytest.skip("no ldd on this system")
