@@ -404,6 +404,9 @@ def _reach(tree: Any, least_m: float = NEAR_M) -> float:
 
 def lies_along(before: Float64, now: Float64) -> bool:
     """Whether of two surfaces, points (N, 3), one lies at the other: what was seen in part has not moved."""
+    apart = np.maximum(before.min(axis=0) - now.max(axis=0), now.min(axis=0) - before.max(axis=0))
+    if (apart > LEAST_SHIFT_M).any():
+        return False
     one, other = scipy.spatial.KDTree(before), scipy.spatial.KDTree(now)
     within = (
         np.mean(tree.query(points)[0] < _reach(tree, LEAST_SHIFT_M)) for tree, points in ((one, now), (other, before))
