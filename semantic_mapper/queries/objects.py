@@ -24,6 +24,7 @@ from semantic_mapper.queries.instances import OrientedBox, upright_box
 from semantic_mapper.queries.revisit import (
     FIXTURES,
     GONE_FREE,
+    LEAST_SHIFT_M,
     SHIFTED_FREE,
     SIGNATURE,
     Candidate,
@@ -187,7 +188,7 @@ class ObjectMemory:
         goers, missed = self._goers(old, now, fit)
         began = stamp_ns if before is None else before.stamp_ns
         still = {j for i, j in same if before is None or old[i].places[-1].stamp_ns > began}
-        for i in tuple(goers):
+        for i in [i for i, goer in goers.items() if goer.free < GONE_FREE]:
             surface = transform(fit.at(old[i].box.center), old[i].surface)
             kin = [j for j, t in enumerate(now.things) if t.class_id == old[i].class_id and came_free[j] < GONE_FREE]
             if stood := {j for j in kin if lies_along(surface, points[j])}:
@@ -225,7 +226,7 @@ class ObjectMemory:
                 self._objects[thing.id] = replace(thing, missed=thing.missed + missed[i])
         there = [o.box for o in old if o.id in left]
         for part in taken:
-            if len(touching([part.box, *there])) <= len(there):  # a part of what left
+            if any(len(touching([part.box, box])) == 1 for box in there):  # a part of what left
                 continue
             thing = self._with_id(part)
             self._objects[thing.id] = replace(thing, gone_ns=stamp_ns, missed=1)
@@ -303,11 +304,12 @@ class ObjectMemory:
     def moved_by(self, T_new_old: Float64, later_ns: int = 0) -> ObjectMemory:
         """The same objects where the world is another one, at ``T_new_old`` (4, 4), and stamps are later."""
         moved = (_moved_by(thing, T_new_old, later_ns) for thing in self._objects.values())
-        return ObjectMemory(moved, self._next_id, self._last_ns + later_ns if self._objects else NEVER_NS)
+        return ObjectMemory(moved, self._next_id, NEVER_NS if self._last_ns == NEVER_NS else self._last_ns + later_ns)
 
     def join(self, other: ObjectMemory) -> None:
         """Take over the objects of another map of the same world. What is there in both, at one place and of one class,
         is one object, with the id of here; others get new ids."""
+        self._last_ns = max(self._last_ns, other.last_ns)
         ours, theirs = self.there, other.objects
         there = [k for k, thing in enumerate(theirs) if thing.gone_ns is None]
         points = [theirs[k].surface for k in there]
@@ -371,7 +373,9 @@ class ObjectMemory:
 def _candidate(thing: MapObject, T_now_then: Float64, free: float) -> Candidate:
     """What was there and may be so no longer; ``free`` as of ``Candidate``."""
     centers = transform(T_now_then, np.stack((thing.surface.mean(axis=0), thing.box.center)))
-    return Candidate(thing.class_id, thing.box.size, centers, free, thing.signature, thing.color)
+    return Candidate(
+        thing.class_id, thing.box.size, centers, free, thing.signature, thing.color, thing.gone_ns is not None
+    )
 
 
 def _joined(now: MapVisit, free: list[float]) -> tuple[MapVisit, list[float]]:
@@ -446,11 +450,12 @@ def changes_of(objects: Iterable[MapObject], since_ns: int) -> tuple[ObjectChang
     found: list[ObjectChange] = []
     for thing in objects:
         known = thing.first_seen_ns <= since_ns
-        earlier = [place for place in thing.places if place.stamp_ns <= since_ns]
+        then = [thing.places[0], *(place for place in thing.places if place.stamp_ns <= since_ns)][-1]
+        elsewhere = np.linalg.norm(thing.places[-1].box.center - then.box.center) >= LEAST_SHIFT_M  # it may be back
         if known and thing.gone_ns is not None and thing.gone_ns > since_ns:
-            found.append(ObjectChange("gone", thing, (earlier or thing.places)[-1], thing.certainty))
-        elif known and thing.gone_ns is None and thing.places[-1].stamp_ns > since_ns:
-            found.append(ObjectChange("moved", thing, (earlier or thing.places)[-1], thing.certainty))
+            found.append(ObjectChange("gone", thing, then, thing.certainty))
+        elif known and thing.gone_ns is None and thing.places[-1].stamp_ns > since_ns and elsewhere:
+            found.append(ObjectChange("moved", thing, then, thing.certainty))
         elif not known and thing.gone_ns is None and thing.appeared:
             found.append(ObjectChange("new", thing, None, thing.certainty))
     return tuple(sorted(found, key=lambda change: (-change.probability, change.object.id)))

@@ -146,11 +146,12 @@ class Evidence(NamedTuple):
 
     @property
     def free_of(self) -> float:
-        """Fraction free of those known, less where no view sees through them; 0 where too few are known."""
+        """Fraction free of those known; less where it is most and no view sees through it, 0 where few are known."""
         known = int((self.free | self.solid).sum())
         if known < LEAST_KNOWN * len(self.free):
             return 0.0
-        return float(self.free.sum() / known) * (1.0 if self.looks else BY_GRID)
+        fraction = float(self.free.sum() / known)
+        return fraction * BY_GRID if fraction >= GONE_FREE and not self.looks else fraction
 
 
 class Candidate(NamedTuple):
@@ -162,6 +163,7 @@ class Candidate(NamedTuple):
     free: float  # of what is known of its place in the other map
     signature: NDArray[np.int8]
     color: UInt8  # (3,)
+    away: bool = False  # since an earlier visit: it may be back where it was
 
 
 def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) -> list[tuple[int, int, float]]:
@@ -172,7 +174,7 @@ def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) ->
             # Of what is seen from another side the one or the other lies elsewhere.
             shift = float(np.linalg.norm(b.centers - a.centers, axis=1).min())
             near = shift <= float(a.size.max()) and a.class_id == b.class_id
-            if shift >= LEAST_SHIFT_M and (near or min(a.free, b.free) >= GONE_FREE):
+            if (shift >= LEAST_SHIFT_M or a.away) and (near or min(a.free, b.free) >= GONE_FREE):
                 cost[row, column] = pair_cost(a, b)
     return [(r, c, _likelihood(cost[r, c])) for r, c in _assign(cost)]
 
@@ -348,13 +350,14 @@ def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
 
 def touching(boxes: Sequence[OrientedBox], classes: Sequence[int] = ()) -> list[list[int]]:
     """Groups of pieces whose boxes touch; of one class, where classes are given."""
-    reach = [np.abs(box.R_world_box) @ box.size / 2 for box in boxes]
-    ends = [(box.center - half - TOUCH_M, box.center + half) for box, half in zip(boxes, reach, strict=True)]
     groups: list[list[int]] = []
 
     def touch(k: int, m: int) -> bool:
-        same = not classes or classes[k] == classes[m]
-        return same and bool((ends[m][0] <= ends[k][1]).all() and (ends[k][0] <= ends[m][1]).all())
+        a, b = boxes[k], boxes[m]
+        axes = np.concatenate((a.R_world_box.T, b.R_world_box.T))
+        reach = sum(np.abs(axes @ box.R_world_box) @ box.size / 2 for box in (a, b))
+        apart = np.abs(axes @ (b.center - a.center)) > reach + TOUCH_M
+        return (not classes or classes[k] == classes[m]) and not apart.any()
 
     for k in range(len(boxes)):
         near = [g for g in groups if any(touch(k, m) for m in g)]
@@ -396,10 +399,10 @@ def overlapping(
     return found
 
 
-def _reach(tree: Any, least_m: float = NEAR_M) -> float:
+def _reach(tree: Any) -> float:
     """How far points of the same surface may lie from the points of a tree, metres."""
     spacing = tree.query(tree.data, 2)[0][:, 1] if tree.n > 1 else np.zeros(1)
-    return max(least_m, 1.2 * float(np.median(spacing)))
+    return max(NEAR_M, 1.2 * float(np.median(spacing)))
 
 
 def lies_along(before: Float64, now: Float64) -> bool:
@@ -407,10 +410,7 @@ def lies_along(before: Float64, now: Float64) -> bool:
     apart = np.maximum(before.min(axis=0) - now.max(axis=0), now.min(axis=0) - before.max(axis=0))
     if (apart > LEAST_SHIFT_M).any():
         return False
-    one, other = scipy.spatial.KDTree(before), scipy.spatial.KDTree(now)
-    within = (
-        np.mean(tree.query(points)[0] < _reach(tree, LEAST_SHIFT_M)) for tree, points in ((one, now), (other, before))
-    )
+    within = (np.mean(scipy.spatial.KDTree(a).query(b)[0] < LEAST_SHIFT_M) for a, b in ((before, now), (now, before)))
     return bool(max(within) > STANDS)
 
 

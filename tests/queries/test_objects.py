@@ -6,6 +6,7 @@ import time
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -127,10 +128,32 @@ def test_what_was_brought_back_is_what_was_taken_away() -> None:
     assert (change.kind, change.object.id, change.object.gone_ns) == ("moved", bench.id, None)
 
 
+def test_what_is_put_back_is_what_was_there_and_has_not_moved() -> None:
+    memory, with_it, without = ObjectMemory(), [*two_rooms(), box(CHEST, 0.6, 0.6)], two_rooms()
+    days = [visit(with_it, 10), visit(without, 20), visit(with_it, 30)]
+    memory.update(days[0], UP)
+    ids = {o.id for o in memory.there}
+    for before, now in pairwise(days):
+        memory.update(now, UP, before=before)
+    assert {o.id for o in memory.there} == ids
+    assert not changes_of(memory.objects, 10)
+
+
+def test_what_was_joined_from_another_map_can_be_moved_in_time() -> None:
+    known, joined = ObjectMemory(), ObjectMemory()
+    known.update(visit(two_rooms(), 10), UP)
+    joined.join(known)
+    assert joined.last_ns == 10
+    assert ObjectMemory.from_bytes(joined.moved_by(np.eye(4), -5).to_bytes()).last_ns == 5
+
+
 def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
     turned, size = yaw_transform(np.zeros(3), 90)[:3, :3], np.array((0.2, 0.1, 0.1))  # 0.1 along x
     seat, leg, other, far = (OrientedBox(np.array((x, 0, 0)), size, turned) for x in (0.0, 0.13, 0.26, 0.6))
     assert touching([seat, leg, other, far], [5, 5, 9, 9]) == [[0, 1], [2], [3]]
+    slanted = yaw_transform(np.zeros(3), 45)[:3, :3]
+    chairs = [OrientedBox(slanted @ (x, 0, 0), np.array((0.4, 0.4, 0.9)), slanted) for x in (0.0, 0.5, 0.92)]
+    assert touching(chairs) == [[0], [1, 2]]  # 10 cm apart, 2 cm
     assert sorted(map(sorted, touching([far, seat, other, leg]))) == [[0], [1, 2, 3]]
 
 
@@ -150,6 +173,8 @@ def test_a_part_of_a_surface_lies_along_it_and_one_moved_by_10_cm_does_not() -> 
     shell = faces[((faces < 0.001) | (faces > 0.299)).any(axis=1)]
     assert lies_along(shell, shell[shell[:, 0] < 0.1]) and lies_along(shell[shell[:, 0] < 0.1], shell)
     assert not lies_along(shell, shell + np.array((0.1, 0, 0)))
+    sofa = np.stack(np.meshgrid(np.linspace(0, 2, 12), np.linspace(0, 0.9, 8), [0.8]), axis=-1).reshape(-1, 3)
+    assert not lies_along(sofa, sofa + np.array((0.09, 0.06, 0)))  # what is kept of a large thing lies far apart
 
 
 def test_a_sliver_and_a_speck_are_never_called_gone() -> None:
