@@ -468,8 +468,12 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange
     Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
     ``before``; else it then remembers what this finds. Where stamps do not say that ``before`` is the earlier one, as
     those that count from a robot's start, its stamps (and those of what it remembers) become ones before ``now``'s
-    first. Raises MapError: the maps do not fit each other, nobody knows how they lie, or no metres or floor are known.
+    first. Raises MapError: the maps have other classes or do not fit each other, nobody knows how they lie, or no
+    metres or floor are known.
     """
+    if now.label_set != before.label_set:
+        names = now.label_set.name, before.label_set.name
+        raise MapError("changes: the map has classes of {!r}, the earlier one others, of {!r}".format(*names))
     ours, theirs = (ObjectMemory.from_bytes(m.objects) for m in (now, before))
     if len(theirs) and all((o := ours.get(t.id)) and o.first_seen_ns == t.first_seen_ns for t in theirs.objects):
         return changes_of(ours.objects, before.last_stamp_ns), before

@@ -24,6 +24,7 @@ from semantic_mapper.queries.objects import (
     MAX_PLACES,
     MapObject,
     ObjectMemory,
+    changes_between,
     changes_of,
     remember,
     visit_of,
@@ -145,6 +146,12 @@ def test_what_was_joined_from_another_map_can_be_moved_in_time() -> None:
     joined.join(known)
     assert joined.last_ns == 10
     assert ObjectMemory.from_bytes(joined.moved_by(np.eye(4), -5).to_bytes()).last_ns == 5
+
+
+def test_maps_of_other_classes_are_not_compared() -> None:
+    others = VoxelMap(VoxelMapConfig(), replace(LABELS, name="others"))
+    with pytest.raises(MapError, match=r"classes of .*, the earlier one others, of 'others'"):
+        changes_between(VoxelMap(VoxelMapConfig(), LABELS), others)
 
 
 def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
