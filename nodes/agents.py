@@ -31,14 +31,14 @@ class MapNow(NamedTuple):
     snapshot: MapSnapshot
     objects: tuple[MapObject, ...]
     up: Float64  # (3,) unit vector
-    since_ns: int  # after which there are changes
+    since_ns: int | None  # after which there are changes; None = there is no map of before
     changes: tuple[ObjectChange, ...]
 
 
 def read_live(client: MapClient) -> MapNow:
     """The map of a running mapper. Raises as ``MapClient.objects`` does."""
     known, up = client.objects(), client.up()
-    return MapNow(client.mirror().snapshot(), known.objects, up, known.since_ns, known.changes)
+    return MapNow(client.mirror().snapshot(), known.objects, up, known.since_ns or None, known.changes)
 
 
 class MapTools:
@@ -79,9 +79,10 @@ class MapTools:
         wanted = room.casefold().removeprefix("the ").removeprefix("room").strip()
         if not wanted:
             return {"rooms": [_room(number, kinds[number], objects) for number in sorted(kinds)]}
-        number = int(wanted) if wanted.isdecimal() else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
+        by_id = wanted.isdecimal() and len(wanted) < 10
+        number = int(wanted) if by_id else max(kinds, key=lambda n: kinds[n].get(wanted, 0), default=0)
         likeliest = {n: max(kind, key=kind.__getitem__) for n, kind in sorted(kinds.items())}
-        if number not in kinds or not (wanted.isdecimal() or likeliest[number] == wanted):
+        if number not in kinds or not (by_id or likeliest[number] == wanted):
             names = [f"{n} ({kind or 'of no kind'})" for n, kind in likeliest.items()]
             raise MapError(f"no room '{room}' is known; rooms are {', '.join(names) or 'not known at all'}")
         things = [

@@ -14,6 +14,7 @@ from semantic_mapper.queries.instances import Instance, OrientedBox
 from semantic_mapper.queries.nearest import NearestSurface, PointAnswers
 from semantic_mapper.queries.objects import ObjectChange, ObjectPlace
 from semantic_mapper.queries.occupancy import State
+from semantic_mapper.queries.phrase import OTHER_WEIGHT
 from semantic_mapper.queries.questions import RememberedObjects
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
@@ -90,10 +91,10 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
     return found
 
 
-def answer_changes(since_ns: int, changes: Sequence[ObjectChange]) -> dict[str, Any]:
-    """What was moved, is new, or has gone after a stamp, the surest first. Raises MapError: the stamp is 0, since there
-    is no map of before."""
-    if not since_ns:
+def answer_changes(since_ns: int | None, changes: Sequence[ObjectChange]) -> dict[str, Any]:
+    """What was moved, is new, or has gone after a stamp, the surest first. Raises MapError: there is no stamp, since
+    there is no map of before."""
+    if since_ns is None:
         raise MapError(
             "changes: there is no map of before; `up --set map=FILE` goes on in one, and --since names that of a saved "
             "map"
@@ -118,7 +119,7 @@ def answer_changes(since_ns: int, changes: Sequence[ObjectChange]) -> dict[str, 
 
 
 def answer_find(phrase: str, answers: Sequence[FoundObject]) -> dict[str, Any]:
-    """The objects that a phrase means, the likeliest first."""
+    """The objects that a phrase means, the likeliest first; and a note where no class is meant alone."""
     found = [
         {
             "id": answer.object.id,
@@ -135,7 +136,9 @@ def answer_find(phrase: str, answers: Sequence[FoundObject]) -> dict[str, Any]:
         }
         for answer in answers
     ]
-    return {"question": "find", "phrase": phrase, "answers": found}
+    vague = answers and all(answer.parts["class"] <= OTHER_WEIGHT for answer in answers)
+    note = {"note": "no class of the map is this thing alone: these are of a class of many kinds"} if vague else {}
+    return {"question": "find", "phrase": phrase, **note, "answers": found}
 
 
 def describe_memory(memory: RememberedObjects) -> list[dict[str, Any]]:

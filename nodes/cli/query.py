@@ -137,7 +137,7 @@ def query(
         found = {"map": source, **_find(source, name, axis, pictures, remote, live=live)}
         output.print(answer_table(found))
     elif question == "changes" and not live:
-        found = {"map": source, **_saved_changes(source, since, picture)}
+        found = {"map": source, **_saved_changes(source, since, picture, axis)}
         output.print(answer_table(found))
     else:
         client = MapClient(source, server=remote.server, keys=remote.keys) if live else nullcontext(open_saved(source))
@@ -203,7 +203,7 @@ def answer(
         case "changes":
             assert not saved  # see ``_saved_changes``
             remembered = world_map.objects(up)
-            return map_answers.answer_changes(remembered.since_ns, remembered.changes)
+            return map_answers.answer_changes(remembered.since_ns or None, remembered.changes)
         case _:  # the graph
             graph = GraphTracker(up).update(world_map) if saved else world_map.graph(up)
             if picture is not None and graph.floors:
@@ -211,16 +211,17 @@ def answer(
             return map_answers.answer_graph(graph)
 
 
-def _saved_changes(source: str, since: Path | None, picture: Path | None) -> dict[str, Any]:
+def _saved_changes(source: str, since: Path | None, picture: Path | None, up: Up | None) -> dict[str, Any]:
     """What has changed between two saved maps, and a picture of it."""
     if since is None:
         raise ConfigError("`changes` of a saved map needs the map of before: --since MAP")
     must_be_there(Path(source), since)
     before, now = (VoxelMap.load(map_path(path)) for path in (since, Path(source)))
-    changes, before = changes_between(now, before)
+    changes, before = changes_between(now, before, up)
     if picture is not None:
-        up, title = up_in(MapMirror.of(now).snapshot()), f"{since} and {source}"
-        write_picture(picture, draw_changes(before.points(), now.points(), changes, up, title=title))
+        axis = up_in(MapMirror.of(now).snapshot()) if up is None else np.array(up)
+        title = f"{since} and {source}"
+        write_picture(picture, draw_changes(before.points(), now.points(), changes, axis, title=title))
     return map_answers.answer_changes(before.last_stamp_ns, changes)
 
 
@@ -239,7 +240,7 @@ def _find(
             snapshot = None if pictures is None else client.mirror().snapshot()
     else:
         must_be_there(Path(source))
-        snapshot, objects = open_objects(map_path(Path(source)))
+        snapshot, objects = open_objects(map_path(Path(source)), up)
         answers = find(phrase, snapshot, objects, up=up)
     found = map_answers.answer_find(phrase, answers)
     for old in () if pictures is None else pictures.glob("[0-9]_object_[0-9]*.png"):
@@ -412,7 +413,8 @@ def _find_table(found: dict[str, Any]) -> Table:
         for a in found["answers"]
     ]
     names = ("id", "class", "probability", "room", "center, m", "last seen", "look from, m")
-    caption = _plain_names(found["answers"]) if rows else "nothing in the map fits all of it"
+    notes = (found.get("note", ""), _plain_names(found["answers"])) if rows else ("nothing in the map fits all of it",)
+    caption = "; ".join(filter(None, notes))
     return table(rows, names, title=f"{found['map']}: {found['phrase']}", caption=caption)
 
 

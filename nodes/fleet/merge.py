@@ -12,18 +12,21 @@ import numpy as np
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import check_pose, rotation_vector, yaw_transform
-from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.mapping.map_alignment import AlignmentError, find_alignment
 from semantic_mapper.mapping.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.map_types import require_same_scale
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet.store import Store, fetch, is_store, is_url
 from semantic_mapper.plain_text import without_secrets
-from semantic_mapper.queries.objects import ObjectMemory, remember
+from semantic_mapper.queries.graph import GraphTracker
+from semantic_mapper.queries.objects import ObjectMemory, brought_up
+from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX, map_path
 from semantic_mapper.types import Float64
 
 MEMORY_MB = 1000  # of the merged map, and of the one that is added to it
 _MAX_BLOCKS = 1 << 27
+_WAY_OUT = 'give their poses: --poses FILE, with {"NAME": [x, y, z, yaw_deg], ...}; all 0 where they are in one world'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,13 +76,11 @@ def merge_maps(
                             f"{found.agreeing} of {found.looked_for} places found in the maps before it; at "
                             f"({where[0]:.2f}, {where[1]:.2f}, {where[2]:.2f}), turned by {turn:.1f} degrees"
                         )
-                    if not loaded.objects:
-                        remember(loaded)
-                    objects = ObjectMemory.from_bytes(loaded.objects)
+                    objects = brought_up(loaded) or ObjectMemory()
                     whole.add(loaded, T_world_map)
                     memory.join(objects.moved_by(T_world_map))
                 except MapError as error:
-                    refused[name] = str(error)
+                    refused[name] = f"{error}; {_WAY_OUT}" if isinstance(error, AlignmentError) else str(error)
                     continue
                 poses[name] = T_world_map
                 notes.append(f"{name}: {note}")
@@ -88,7 +89,11 @@ def merge_maps(
                 reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
                 raise MapError(f"these maps cannot be added; leave them out, or do as it says: {reasons}")
             waiting = list(refused)
-    whole.objects = memory.to_bytes() if len(memory) else b""
+    if len(memory):
+        graphs = GraphTracker()
+        graphs.update(MapMirror.of(whole).snapshot(), ())
+        memory.put_in_rooms(graphs.room_of)  # those of the whole
+        whole.objects = memory.to_bytes()
     return MergeReport(whole, poses, tuple(notes))
 
 

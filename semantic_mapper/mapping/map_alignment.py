@@ -31,9 +31,12 @@ _NEAR_M = (0.06, 0.03)  # of two surfaces that are taken for one, at first and t
 _POINTS = 300_000  # of the other map, at most
 _ROUNDS = 50
 _VIEW = CameraIntrinsics(262.5, 262.5, 159.5, 119.5, 320, 240)
-_WAY_OUT = 'Give their poses: --poses FILE, with {"NAME": [x, y, z, yaw_deg], ...}; all 0 where they are in one world'
 
 _log = get_logger(__name__)
+
+
+class AlignmentError(MapError):
+    """It is not known where one map lies in another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,14 +51,14 @@ class MapAlignment:
 def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     """Where another map lies in this one.
 
-    ``MapError`` says why: the maps do not fit each other, nothing is found, or not for sure."""
+    ``MapError`` says why: the maps do not fit each other, or ``AlignmentError``."""
     check_fit(voxel_map.config, voxel_map.label_set, other.config, other.label_set)
     require_same_scale(voxel_map.scale_known, other.scale_known, "merge")
     for one, which in ((voxel_map, "first"), (other, "second")):
         if not len(one.places):
-            raise MapError(
+            raise AlignmentError(
                 f"where the maps lie cannot be found: the {which} one has nothing to find itself by (made without "
-                f"depth, or with keyframes.save_places = false). {_WAY_OUT}"
+                "depth, or with keyframes.save_places = false)"
             )
     finder = Relocalizer(voxel_map.places.places, voxel_map, voxel_map.label_set.ignore_id)
     chosen = other.places.places[:: max(1, -(-len(other.places) // LOOKED_FOR))]
@@ -64,9 +67,9 @@ def find_alignment(voxel_map: VoxelMap, other: VoxelMap) -> MapAlignment:
     consensus = find_consensus(seen)
     if consensus.refusal:
         refused = ", ".join(sorted({found.reason for _, found in looks if isinstance(found, NotFound)}))
-        raise MapError(
+        raise AlignmentError(
             f"where the maps lie cannot be found: of {len(chosen)} places of the second {len(seen)} were found in the "
-            f"first ({refused or 'none was refused'}), and {consensus.refusal}. {_WAY_OUT}"
+            f"first ({refused or 'none was refused'}), and {consensus.refusal}"
         )
     T = agreed(consensus.agreeing)
     refined = _refine(voxel_map, other, T)

@@ -6,6 +6,7 @@ size, room and relation (softened: there is no sharp end of red or near), and th
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +17,14 @@ import scipy  # loads `spatial` when it is first used
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import look_at
+from semantic_mapper.geometry import invert_pose, look_at, transform
 from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.map_file import open_map
+from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import check_up
 from semantic_mapper.queries.instances import thing_voxels
-from semantic_mapper.queries.objects import MapObject, ObjectMemory, remember
+from semantic_mapper.queries.objects import MapObject, ObjectMemory, brought_up
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.phrase import COLORS, ROOM_KINDS, NounPhrase, read_phrase
 from semantic_mapper.queries.snapshot import MapMirror, MapSnapshot
@@ -42,6 +44,7 @@ TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
 ROOM_OF_NO_KIND = 1.0  # weight of evidence, against those of ``ROOM_KINDS``
 LOOK_M, EYE_M = (0.5, 2.5), 1.2  # from a thing; height of a camera over the floor
 RADIUS_M, BODY_M, FLOORS = 0.25, (0.15, 1.5, 0.1), {"floor", "floormat"}  # of a robot; heights that it takes, step
+MARK_RGB = (255, 140, 0)  # edges of the box of a thing in its picture
 VIEW_DIRECTIONS, VIEW_DISTANCES, VIEW_RAYS, LEAST_VISIBLE, LEVEL_M = 24, 5, 32, 0.2, 0.15
 
 
@@ -93,6 +96,7 @@ def find(
     fits = scene.most(phrase.thing, [objects[n] for _, n, _ in found], [p for p, _, _ in found])
     if any(abs(sign) == 2 for _, sign in phrase.thing.sizes):
         found = [(p * fit, n, parts | {"most": fit}) for (p, n, parts), fit in zip(found, fits, strict=True)]
+        found = [answer for answer in found if answer[0] >= LEAST_PROBABILITY]
     best = sorted(found, key=lambda f: (-f[0], objects[f[1]].id))[:limit]
     return tuple(
         FoundObject(objects[n], p, parts, scene.kind(objects[n].room), view_of(snapshot, objects[n], axis))
@@ -100,19 +104,19 @@ def find(
     )
 
 
-def open_objects(path: Path) -> tuple[MapSnapshot, tuple[MapObject, ...]]:
+def open_objects(path: Path, up: ArrayLike | None = None) -> tuple[MapSnapshot, tuple[MapObject, ...]]:
     """A saved map, and the objects that it remembers; brought up to the present where what it remembers is older.
 
-    Raises MapError: as of ``VoxelMap.load``; no metres, or no floor."""
+    Raises MapError: as of ``VoxelMap.load``; no metres; or ``up`` (3,) is not given, and no floor was found."""
     with open_map(path) as reader:
         memory, stamp_ns = ObjectMemory.from_bytes(reader.objects()), reader.manifest.last_stamp_ns
     if len(memory) and memory.last_ns >= stamp_ns:
         return MapMirror.load(path).snapshot(), memory.objects
     voxel_map = VoxelMap.load(path)
-    voxel_map.objects_version = 0  # when it changed is not in the file
-    if remember(voxel_map) is None:
-        raise MapError(f"{path}: things are found where lengths are metres and a floor was seen, which is not so here")
-    return MapMirror.of(voxel_map).snapshot(), ObjectMemory.from_bytes(voxel_map.objects).objects
+    require_metres(voxel_map.scale_known, f"{path}: find")
+    if (found := brought_up(voxel_map, up)) is None:
+        raise MapError(f"{path}: no floor was found, by which it is known which way is up; --up says so")
+    return MapMirror.of(voxel_map).snapshot(), found.objects
 
 
 class _Scene:
@@ -316,7 +320,8 @@ def render(snapshot: MapSnapshot, T_world_camera: Float64, width: int = 320, fov
 
 
 def picture_of(snapshot: MapSnapshot, found: FoundObject, up: Float64, width: int = 320) -> UInt8:
-    """A crop (H, W, 3) uint8 round an object, seen from where ``found`` says, or from above the side that was seen."""
+    """A crop (H, W, 3) uint8 round an object and its box, seen from where ``found`` says, or from above the side that
+    was seen."""
     box = found.object.box
     size = float(np.linalg.norm(box.size))
     T = found.T_world_camera
@@ -328,4 +333,14 @@ def picture_of(snapshot: MapSnapshot, found: FoundObject, up: Float64, width: in
         way = ways[free.sum(axis=1).argmax()]  # the side that was seen
         T = look_at(box.center + (size + 0.5) * way, box.center, up)
     distance = float(np.linalg.norm(T[:3, 3] - box.center))
-    return render(snapshot, T, width, 2 * float(np.arctan(0.8 * size / distance)))
+    fov_rad = 2 * float(np.arctan(0.8 * size / distance))
+    picture = np.ascontiguousarray(render(snapshot, T, width, fov_rad))
+    corners = (np.array([*np.ndindex(2, 2, 2)]) - 0.5) * box.size @ box.R_world_box.T + box.center
+    seen = transform(invert_pose(T), corners)
+    middle = (np.array(picture.shape[1::-1]) - 1) / 2
+    uv = seen[:, :2] / np.maximum(seen[:, 2:], 0.05) * width / 2 / np.tan(fov_rad / 2) + middle
+    ends = np.clip(np.round(uv), -(1 << 15), 1 << 15).astype(int).tolist()
+    for one, other in itertools.combinations(range(8), 2):
+        if (one ^ other).bit_count() == 1:  # an edge of the box
+            cv2.line(picture, ends[one], ends[other], MARK_RGB, max(1, width // 320), cv2.LINE_AA)
+    return picture

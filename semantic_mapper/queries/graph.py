@@ -113,6 +113,7 @@ class GraphTracker:
         self._up = None if up is None else check_up(up)
         self._things: InstanceTracker | None = None
         self._plans: tuple[_Plan, ...] = ()
+        self._cell_m = CELL_M
         self._next_floor = self._next_room = 1
         self._lock = threading.Lock()
 
@@ -159,15 +160,20 @@ class GraphTracker:
                     one, other = sorted(ids[number] for number in passage.rooms)
                     middle = _to_world(np.array(passage.cell[::-1]) + 0.5, plan, R_grid_world, cell_m)
                     doors.append(Door((one, other), middle, passage.width_m))
-            self._plans = tuple(plans)
+            self._plans, self._cell_m = tuple(plans), cell_m
         return SceneGraph(
             up,
             tuple(floors),
             tuple(sorted(rooms, key=lambda room: room.id)),
             tuple(sorted(doors, key=lambda door: door.rooms)),
             things,
-            {thing.id: _room_of(thing, snapshot.voxel_size_m, R_grid_world, plans, cell_m) for thing in things},
+            {t.id: _room_of(t.voxels * np.float64(snapshot.voxel_size_m), R_grid_world, plans, cell_m) for t in things},
         )
+
+    def room_of(self, points: Float64) -> int | None:
+        """Room of the last update that holds most of points (N, 3), world metres, of a thing; None = none does."""
+        up = np.array((0.0, 0.0, 1.0)) if self._up is None else self._up
+        return _room_of(points, turn_onto(up, np.array((0.0, 0.0, 1.0))), self._plans, self._cell_m)
 
     def _identify(
         self, found: RoomPlan, height: float, first: Int64, taken: Sequence[_Plan]
@@ -293,12 +299,9 @@ def _match(last: _Plan, found: RoomPlan, first: Int64, numbers: Int64) -> None:
             numbers[best] = old
 
 
-def _room_of(
-    thing: Instance, voxel_size_m: float, R_grid_world: Float64, plans: Sequence[_Plan], cell_m: float
-) -> int | None:
-    """Id of the room that holds most of a thing's voxels, or is nearest to most of them."""
-    step = 1 + len(thing.voxels) // ROOM_VOXELS
-    xyz = thing.voxels[::step] @ (R_grid_world.T * voxel_size_m)
+def _room_of(points: Float64, R_grid_world: Float64, plans: Sequence[_Plan], cell_m: float) -> int | None:
+    """Id of the room that holds most of a thing's points (N, 3), world metres, or is nearest to most of them."""
+    xyz = points[:: 1 + len(points) // ROOM_VOXELS] @ R_grid_world.T
     below = [plan for plan in plans if plan.height_m <= float(np.median(xyz[:, 2])) + LOW_M[1]]
     if not below:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.localization.places import shared_places
-from semantic_mapper.mapping.map_alignment import find_alignment
+from semantic_mapper.mapping.map_alignment import AlignmentError, find_alignment
 from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
@@ -336,6 +336,13 @@ class ObjectMemory:
             )
         self._forget()
 
+    def put_in_rooms(self, room_of: Callable[[Float64], int | None]) -> None:
+        """Say in which rooms all are and were; ``room_of`` as of ``GraphTracker.room_of``."""
+        for thing in self._objects.values():
+            rooms = [room_of(thing.surface - thing.box.center + place.box.center) for place in thing.places]
+            places = tuple(replace(p, room=room) for p, room in zip(thing.places, rooms, strict=True))
+            self._objects[thing.id] = replace(thing, room=rooms[-1], places=places)
+
     def to_bytes(self) -> bytes:
         """For a file; see ``from_bytes``."""
         content = msgspec.msgpack.encode(_Rows(self._next_id, self.objects, self._last_ns), enc_hook=_pack)
@@ -401,19 +408,19 @@ def _as_one(pieces: Sequence[MapObject]) -> MapObject:
         box=box,
         color=np.average([p.color for p in pieces], axis=0, weights=weights).astype(np.uint8),
         signature=np.sqrt(looks).round().astype(np.int8),
-        points=np.round((points[:: -(-len(points) // POINTS)] - box.center) * 1000).astype(np.int16),
+        points=_millimetres(points[:: -(-len(points) // POINTS)] - box.center),
         places=(*largest.places[:-1], replace(largest.places[-1], box=box)),
     )
 
 
-def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph | None:
+def remember(voxel_map: VoxelMap, before: MapVisit | None = None, up: ArrayLike | None = None) -> SceneGraph | None:
     """The graph of a finished map, with its things taken over into what the map remembers (``VoxelMap.objects``); None,
-    and nothing is taken over, where its lengths are not metres, or nothing in it is known to be floor. ``before`` as of
-    ``ObjectMemory.update``. Raises MapError: what the map remembers is damaged."""
+    and nothing is taken over, where its lengths are not metres, or ``up`` (3,) is not given and no floor is known.
+    ``before`` as of ``ObjectMemory.update``. Raises MapError: what the map remembers is damaged."""
     memory = ObjectMemory.from_bytes(voxel_map.objects)
     if not voxel_map.scale_known:
         return None
-    tracker = GraphTracker()
+    tracker = GraphTracker(up)
     try:
         if before is not None:
             graph = tracker.update(before.snapshot)
@@ -426,6 +433,15 @@ def remember(voxel_map: VoxelMap, before: MapVisit | None = None) -> SceneGraph 
         return None
     bring_up(voxel_map, memory, snapshot, graph, before)
     return graph
+
+
+def brought_up(voxel_map: VoxelMap, up: ArrayLike | None = None) -> ObjectMemory | None:
+    """What a loaded map remembers, brought up to the present where that is older; None as of ``remember``."""
+    memory = ObjectMemory.from_bytes(voxel_map.objects)
+    if len(memory) and memory.last_ns >= voxel_map.last_stamp_ns:
+        return memory
+    voxel_map.objects_version = 0  # when it changed is not in the file
+    return None if remember(voxel_map, None, up) is None else ObjectMemory.from_bytes(voxel_map.objects)
 
 
 def bring_up(
@@ -461,16 +477,19 @@ def changes_of(objects: Iterable[MapObject], since_ns: int) -> tuple[ObjectChang
     return tuple(sorted(found, key=lambda change: (-change.probability, change.object.id)))
 
 
-def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange, ...], VoxelMap]:
+def changes_between(
+    now: VoxelMap, before: VoxelMap, up: ArrayLike | None = None
+) -> tuple[tuple[ObjectChange, ...], VoxelMap]:
     """What has become of the things of a map of before in a later one, which goes on in it or is of the same place; and
     the map of before, in the world of the later one.
 
     Maps without a common frame are first aligned by their places. What ``now`` remembers counts where it goes on in
     ``before``; else it then remembers what this finds. Where stamps do not say that ``before`` is the earlier one, as
     those that count from a robot's start, its stamps (and those of what it remembers) become ones before ``now``'s
-    first. Raises MapError: the maps have other classes or do not fit each other, nobody knows how they lie, or no
-    metres or floor are known.
+    first. ``up``, (3,) in the world of ``now``, is by default found by the floor. Raises MapError: the maps have other
+    classes or do not fit each other, nobody knows how they lie, or no metres or floor are known.
     """
+    require_metres(now.scale_known, "changes")
     if now.label_set != before.label_set:
         names = now.label_set.name, before.label_set.name
         raise MapError("changes: the map has classes of {!r}, the earlier one others, of {!r}".format(*names))
@@ -482,15 +501,17 @@ def changes_between(now: VoxelMap, before: VoxelMap) -> tuple[tuple[ObjectChange
         first_ns = min((p.stamp_ns for p in now.places.places), default=now.last_stamp_ns)
         later_ns = first_ns - 1 - before.last_stamp_ns
     if not shared_places(now.places.places, before.places.places):
-        T = find_alignment(now, before).T_map_other
+        try:
+            T = find_alignment(now, before).T_map_other
+        except AlignmentError as error:
+            raise MapError(f"changes: {error}; map later logs in the map of before: --set map=FILE") from error
         aligned = VoxelMap(now.config, now.label_set)
         aligned.add(before, T)
         before = aligned
     before.last_stamp_ns += later_ns
     now.objects, now.objects_version = theirs.moved_by(T, later_ns).to_bytes(), 0
-    require_metres(now.scale_known, "changes")
-    if remember(now, visit_of(before)) is None:
-        raise MapError("changes: no floor was found, by which it is known which way is up")
+    if remember(now, visit_of(before), up) is None:
+        raise MapError("changes: no floor was found, by which it is known which way is up; --up says so")
     return changes_of(ObjectMemory.from_bytes(now.objects).objects, before.last_stamp_ns), before
 
 
@@ -505,7 +526,7 @@ def _moved_by(thing: MapObject, T: Float64, later_ns: int) -> MapObject:
         thing,
         box=moved(thing.box),
         places=places,
-        points=np.round(thing.points @ R.T).astype(np.int16),
+        points=_millimetres(thing.points @ R.T / 1000),
         first_seen_ns=thing.first_seen_ns + later_ns,
         last_seen_ns=thing.last_seen_ns + later_ns,
         gone_ns=None if thing.gone_ns is None else thing.gone_ns + later_ns,
@@ -516,7 +537,6 @@ def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[
     """A thing of now as a new object."""
     thing, snapshot = now.things[j], now.snapshot
     seen_ns = now.stamp_ns if (seen := now.seen_ns(thing)) is None else seen
-    offsets = (sample_points(thing, snapshot, POINTS) - thing.box.center) * 1000
     room = rooms.get(thing.id)
     return MapObject(
         id=number,
@@ -526,7 +546,7 @@ def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[
         box=thing.box,
         color=color_of(snapshot, thing),
         signature=signature_of(snapshot, thing, up),
-        points=np.clip(np.round(offsets), -32767, 32767).astype(np.int16),
+        points=_millimetres(sample_points(thing, snapshot, POINTS) - thing.box.center),
         first_seen_ns=seen_ns,
         last_seen_ns=seen_ns,
         views=1,
@@ -534,6 +554,11 @@ def _remembered(number: int, now: MapVisit, j: int, up: Float64, rooms: Mapping[
         places=(ObjectPlace(now.stamp_ns, thing.box, room),),
         seen=thing.seen,
     )
+
+
+def _millimetres(offsets: Float64) -> NDArray[np.int16]:
+    """Metres (N, 3) as they are kept; what is farther than 32 m from the middle of a thing is kept there."""
+    return np.clip(np.round(offsets * 1000), -32767, 32767).astype(np.int16)
 
 
 def _refreshed(old: MapObject, now: MapVisit, j: int, up: Float64, rooms: Mapping[int, int | None]) -> MapObject:

@@ -128,7 +128,7 @@ def _read_noun(
             sizes.append(_SIZES[word])
         elif encoder is None and _folded(word) not in nouns:
             known = [*nouns, *_COLORS, *_SIZES, *_KINDS, *_RELATIONS]
-            near = difflib.get_close_matches(_folded(word), known, n=3, cutoff=0.6)
+            near = difflib.get_close_matches(_folded(word), dict.fromkeys(known), n=3, cutoff=0.6)
             hint = f"did you mean {' or '.join(near)}?" if near else f"things are {', '.join(labels.names)}"
             raise MapError(f"find: '{word}' is not known; {hint}")
         else:

@@ -168,14 +168,16 @@ class Candidate(NamedTuple):
 
 def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) -> list[tuple[int, int, float]]:
     """Which of those that left are which of those that came, with the probability that they are: at most one each."""
-    cost = np.full((len(goers), len(comers)), np.inf)
+    if not goers or not comers:
+        return []
+    looks, cost = _Looks.of(comers), np.empty((len(goers), len(comers)))
+    centers, free = np.array([b.centers for b in comers]), np.array([b.free for b in comers])
     for row, a in enumerate(goers):
-        for column, b in enumerate(comers):
-            # Of what is seen from another side the one or the other lies elsewhere.
-            shift = float(np.linalg.norm(b.centers - a.centers, axis=1).min())
-            near = shift <= float(a.size.max()) and a.class_id == b.class_id
-            if (shift >= LEAST_SHIFT_M or a.away) and (near or min(a.free, b.free) >= GONE_FREE):
-                cost[row, column] = pair_cost(a, b)
+        # Of what is seen from another side the one or the other lies elsewhere.
+        shift = np.linalg.norm(centers - a.centers, axis=2).min(axis=1)
+        near = (shift <= a.size.max()) & (looks.class_id == a.class_id)
+        possible = ((shift >= LEAST_SHIFT_M) | a.away) & (near | (np.minimum(a.free, free) >= GONE_FREE))
+        cost[row] = np.where(possible, pair_costs(_Looks.of([a]), looks), np.inf)
     return [(r, c, _likelihood(cost[r, c])) for r, c in _assign(cost)]
 
 
@@ -184,30 +186,40 @@ def _likelihood(cost: float) -> float:
 
 
 def _assign(cost: Float64) -> list[tuple[int, int]]:
-    """Pairs of rows and columns of the least total cost, where a row and a column without a pair cost as one of the
-    least odds."""
-    (rows, columns), most = cost.shape, DIFFERENT - LEAST_ODDS
-    if not rows or not columns:
-        return []
-    whole = np.full((rows + columns, rows + columns), 0.0)
-    whole[:rows, :columns] = np.minimum(cost, 1e3)
-    whole[:rows, columns:] = whole[rows:, :columns] = most / 2
-    found = zip(*scipy.optimize.linear_sum_assignment(whole), strict=True)
-    return [(int(r), int(c)) for r, c in found if r < rows and c < columns and cost[r, c] < most]
+    """Pairs of rows and columns of the least total cost, where a row and a column without a pair cost together as one
+    of the least odds."""
+    most = DIFFERENT - LEAST_ODDS
+    found = zip(*scipy.optimize.linear_sum_assignment(np.minimum(cost - most, 0)), strict=True)
+    return [(int(r), int(c)) for r, c in found if cost[r, c] < most]
 
 
-def pair_cost(a: Candidate, b: Candidate) -> float:
-    """How different two things look: the logarithm of their odds of being one is ``DIFFERENT`` less this. The weights
-    are of a logistic regression over homes that no figure is of."""
-    parts = (np.split(c.signature.astype(np.float64) / 127, PARTS) for c in (a, b))
-    chroma, light, drop = (1 - float(x @ y) for x, y in zip(*parts, strict=True))
-    (hue_a, light_a), (hue_b, light_b) = (_tone(c.color[None]) for c in (a, b))
-    hue, bright = float(np.linalg.norm(hue_a - hue_b)), abs(float(light_a[0] - light_b[0]))
-    level_a, level_b = (np.maximum(np.sort(c.size[:2]), LEAST_SIDE_M) for c in (a, b))
-    level = float(np.abs(np.log(level_a / level_b)).mean())
-    high = max(0.0, abs(float(a.size[2] - b.size[2])) - FOOT_M) / max(float(a.size[2]), float(b.size[2]), 0.1)
-    differences = np.array((chroma, hue, light, bright, drop, high, level, a.class_id != b.class_id))
-    return float(WEIGHTS @ differences)
+class _Looks(NamedTuple):
+    """Of N candidates, by row: histograms of unit length of ``signature_of``, one tone, sizes, and class."""
+
+    parts: Sequence[Float64]
+    hue: Float64  # (N, 2)
+    lightness: Float64  # (N,)
+    level: Float64  # (N, 2) logarithms of the shorter and the longer side
+    height: Float64  # (N,)
+    class_id: Int64  # (N,)
+
+    @classmethod
+    def of(cls, things: Sequence[Candidate]) -> _Looks:
+        size = np.array([c.size for c in things])
+        parts = np.split(np.array([c.signature for c in things]) / 127, PARTS, axis=1)
+        tone = _tone(np.array([c.color for c in things]))
+        level = np.log(np.maximum(np.sort(size[:, :2]), LEAST_SIDE_M))
+        return cls(parts, *tone, level, size[:, 2], np.array([c.class_id for c in things]))
+
+
+def pair_costs(a: _Looks, b: _Looks) -> Float64:
+    """How different one thing and others (N,) look: the logarithm of the odds of being one is ``DIFFERENT`` less this
+    (N,). The weights are of a logistic regression over homes that no figure is of."""
+    chroma, light, drop = (1 - (x * y).sum(axis=1) for x, y in zip(a.parts, b.parts, strict=True))
+    hue, bright = np.linalg.norm(a.hue - b.hue, axis=1), np.abs(a.lightness - b.lightness)
+    level = np.abs(a.level - b.level).mean(axis=1)
+    high = np.maximum(0.0, np.abs(a.height - b.height) - FOOT_M) / np.maximum(np.maximum(a.height, b.height), 0.1)
+    return WEIGHTS @ np.array((chroma, hue, light, bright, drop, high, level, a.class_id != b.class_id))
 
 
 def signature_of(snapshot: MapSnapshot, thing: Instance, up: Float64) -> NDArray[np.int8]:

@@ -175,6 +175,25 @@ def test_a_thing_seen_from_another_side_has_not_moved() -> None:
     assert [pair[:2] for pair in match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.1)])] == [(0, 0)]
 
 
+def test_of_two_that_left_the_more_alike_is_the_one_that_came() -> None:
+    signature = np.repeat(np.array((16, 37, 32), np.int8), (64, 12, 16))
+
+    def seen(x: float, side: float) -> Candidate:
+        place = np.array((x, 0, 0)) * np.ones((2, 1))
+        return Candidate(5, np.array((side, side, 0.4)), place, 0.9, signature, np.zeros(3, np.uint8))
+
+    found = match_candidates([seen(0, 0.4), seen(1, 0.5), seen(2, 2.0)], [seen(5, 0.5), seen(9, 0.9)])
+    assert [pair[:2] for pair in found] == [(1, 0)] and found[0][2] > 0.9
+    assert not match_candidates([], [seen(5, 0.5)]) and not match_candidates([seen(5, 0.5)], [])
+
+
+def test_points_far_from_the_middle_of_a_thing_stay_where_they_can_be_kept() -> None:
+    (thing, *_) = full_memory().objects
+    long = replace(thing, points=np.array([(30_000, 30_000, 0)], np.int16))
+    turned = ObjectMemory([long]).moved_by(yaw_transform(np.zeros(3), 45)).objects[0]
+    np.testing.assert_allclose(turned.points, [(0, 32_767, 0)], atol=1)  # and not on the other side
+
+
 def test_a_part_of_a_surface_lies_along_it_and_one_moved_by_10_cm_does_not() -> None:
     faces = np.stack(np.meshgrid(*[np.linspace(0, 0.3, 11)] * 3), axis=-1).reshape(-1, 3)
     shell = faces[((faces < 0.001) | (faces > 0.299)).any(axis=1)]

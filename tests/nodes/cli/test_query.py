@@ -179,6 +179,23 @@ def test_changes_since_a_map_of_before(tmp_path: Path) -> None:
     assert "goes with `changes`" in said
 
 
+def test_what_changed_without_a_floor_needs_to_be_told_which_way_is_up(tmp_path: Path) -> None:
+    view = Place("front", 5, np.eye(4), np.ones((1, 3), np.float32), np.zeros((1, DESCRIPTOR_BYTES), np.uint8))
+    chest: Box = ("table", (0.3, 0.3, 0.0), (0.8, 0.8, 0.4))
+    house = [("wall" if name == "floor" else name, low, high) for name, low, high in two_rooms()]
+    for name, stamp_ns, boxes in (("yesterday", 10, [*house, chest]), ("today", 20, house)):
+        saved = VoxelMap.received(house_changes(boxes, 0), VOXEL_M, LABELS)
+        saved.last_stamp_ns = stamp_ns
+        saved.places.add(view)
+        saved.save(tmp_path / f"{name}.npz")
+    changes = ("changes", "--since", tmp_path / "yesterday.npz")
+    for question in (changes, ("find", "table")):
+        assert "--up says so" in refused("query", tmp_path / "today.npz", *question)
+    found, _ = ask(tmp_path / "today.npz", *changes, "--up", "z", "--picture", tmp_path / "changes.png")
+    assert [(c["kind"], c["class"]) for c in found["changes"]] == [("gone", "table")]
+    assert [a["class"] for a in ask(tmp_path / "today.npz", "find", "table", "--up", "z")[0]["answers"]] == ["table"]
+
+
 def test_things_are_found_by_a_phrase_with_pictures(tmp_path: Path) -> None:
     saved = VoxelMap.received(house_changes(two_rooms(), 0), VOXEL_M, LABELS)
     remember(saved)

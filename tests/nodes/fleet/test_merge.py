@@ -21,12 +21,15 @@ from semantic_mapper.localization.places import Place, make_place
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.fleet import merge
 from semantic_mapper.nodes.fleet.merge import MergeReport, find_maps, merge_maps, read_poses
+from semantic_mapper.queries.graph import find_graph
+from semantic_mapper.queries.objects import ObjectMemory, remember
 from semantic_mapper.replay.log.sequence import open_log
 from tests.mapping.rendered_views import small_map
 from tests.mapping.test_merge import fuse_views, turned
 from tests.mapping.test_voxel_map import same
 from tests.nodes.fleet.made_up import made_up, store_of
 from tests.nodes.support import refused, run_ok
+from tests.queries.house import LABELS, VOXEL_M, Box, house_changes, two_rooms
 
 DEMO = Path(semantic_mapper.__file__).parent / "demo.mcap"
 POSES = {"a": np.eye(4), "b": turned((0, 0, 30), (0.31, -1.27, 0.553)), "c": turned((0, 0, 0), (0.26, -0.06, 0.80))}
@@ -98,6 +101,23 @@ def test_maps_find_where_they_lie_by_what_they_show(tmp_path: Path) -> None:
     report = merged([str(path) for path in sorted(tmp_path.iterdir())], {})
     off = T_map_world @ report.poses["robot-1"]
     assert np.linalg.norm(off[:3, 3]) < 0.02 and "places found in the maps before it" in report.notes[1]
+
+
+def test_things_of_merged_maps_are_in_the_rooms_of_the_whole(tmp_path: Path) -> None:
+    for name, east_m in (("a", 0.0), ("b", 12.0)):
+        boxes: list[Box] = [
+            (kind, (a[0] + east_m, a[1], a[2]), (b[0] + east_m, b[1], b[2])) for kind, a, b in two_rooms()
+        ]
+        made = VoxelMap.received(house_changes(boxes, 0), VOXEL_M, LABELS)
+        made.last_stamp_ns = 10
+        remember(made)
+        made.save(tmp_path / f"{name}.npz")
+    report = merged([str(tmp_path / f"{name}.npz") for name in "ab"], dict.fromkeys("ab", np.eye(4)))
+    graph = find_graph(report.merged)
+    assert graph is not None and len(graph.rooms) == 4
+    tables = ObjectMemory.from_bytes(report.merged.objects).there
+    rooms = {graph.room_of[t.id] for t in graph.things}
+    assert {t.room for t in tables} == rooms == {t.places[-1].room for t in tables} and len(rooms) == len(tables) == 2
 
 
 def test_maps_that_cannot_be_merged_are_refused(maps: list[str], tmp_path: Path) -> None:
