@@ -64,10 +64,12 @@ class DayChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Home:
-    """Rooms on one day, each in its own axes; ``offsets`` (R, 3) are their places in the world."""
+    """Rooms on one day, each in its own axes; ``offsets`` (R, 3) are their places in the world. ``camera`` is the
+    number of the robot's camera, which has one look (contrast, saturation, lens) in all rooms and on all days."""
 
     rooms: tuple[Scene, ...]
     offsets: Float64
+    camera: int
 
 
 def make_home(seed: int) -> Home:
@@ -75,7 +77,7 @@ def make_home(seed: int) -> Home:
     rooms = tuple(make_room(5 * seed + k, RoomConfig(template=name)) for k, name in enumerate(TEMPLATES))
     offsets = np.array([room_cell(k, len(rooms))[0] + (BEYOND_M, BEYOND_M, 0) for k in range(len(rooms))])
     offsets[:, 2] = 0
-    return Home(rooms, offsets)
+    return Home(rooms, offsets, seed)
 
 
 def visit(
@@ -106,7 +108,13 @@ def visit(
             middle[:3, 3] = np.array(scene.size_m) / 2
             known = middle @ errors[number] @ np.linalg.inv(middle) @ poses
         views = render_views(
-            1_000_003 * seed + number, [scene] * len(poses), poses, intrinsics, noise=noise, frame_poses=known
+            1_000_003 * seed + number,
+            [scene] * len(poses),
+            poses,
+            intrinsics,
+            noise=noise,
+            frame_poses=known,
+            camera=home.camera,
         )
         for view in views:
             T, T_true = view.frame.T_world_camera.copy(), view.T_world_camera.copy()
@@ -273,7 +281,7 @@ def next_day(home: Home, seed: int, *, changes: bool = True) -> tuple[Home, list
         found += _swap(movers)
     leaves = np.random.default_rng((79, seed))
     opened = [_swing(scene, leaves) if changes else scene for scene in movers.rooms]
-    return Home(tuple(_relit(scene, rng) for scene in opened), home.offsets), found
+    return Home(tuple(_relit(scene, rng) for scene in opened), home.offsets, home.camera), found
 
 
 def _swing(scene: Scene, rng: np.random.Generator) -> Scene:

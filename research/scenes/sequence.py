@@ -72,6 +72,7 @@ def render_views(
     *,
     noise: NoiseConfig | None = None,
     frame_poses: Float64 | None = None,
+    camera: int | None = None,
 ) -> Iterator[RoomView]:
     """One view of each scene, as frames of one camera.
 
@@ -82,9 +83,10 @@ def render_views(
         intrinsics: Of the camera.
         noise: Depth sensor and noise, another draw each frame; None for perfect sensors.
         frame_poses: (N, 4, 4) where the robot thinks that it is; None: it knows.
+        camera: As of ``sequence_shots``.
     """
     known = poses if frame_poses is None else frame_poses
-    shots = [None] * len(poses) if noise is None else sequence_shots(poses, seed, noise)
+    shots = [None] * len(poses) if noise is None else sequence_shots(poses, seed, noise, camera)
     for index, (scene, shot) in enumerate(zip(scenes, shots, strict=True)):
         view = render_view(
             scene,

@@ -10,7 +10,7 @@ from research.scenes.config import SUITE_VERSION, NoiseConfig
 from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.types import Float64
 
-_SHOT_STREAM = 2  # number of the random stream; rooms and paths use others
+_SHOT_STREAM, _CAMERA_STREAM = 2, 9  # numbers of the random streams; rooms and paths use others
 _GREY = 0.12  # fraction of the sequences that are nearly without colour
 _KEEP = 0.93  # of the drift from one frame to the next
 _TURN_WEIGHT_M = 0.35  # a turn of one radian counts as this much way
@@ -39,11 +39,14 @@ class Shot:
     T_open_close: Float64
 
 
-def sequence_shots(poses: Float64, seed: int, config: NoiseConfig) -> list[Shot]:
+def sequence_shots(poses: Float64, seed: int, config: NoiseConfig, camera: int | None = None) -> list[Shot]:
     """One ``Shot`` for each of the poses (N, 4, 4): one camera and one look, exposure and white balance that drift,
-    and motion towards the next pose. Deterministic in its arguments; shot k does not depend on later ones' number."""
+    and motion towards the next pose. Deterministic in its arguments; shot k does not depend on later ones' number.
+    Sequences of one ``camera`` have its look; by default each has a camera of its own."""
     rng = np.random.default_rng((SUITE_VERSION, seed, _SHOT_STREAM))
     look, blur = _look(rng, config)
+    if camera is not None:
+        look, blur = _look(np.random.default_rng((SUITE_VERSION, camera, _CAMERA_STREAM)), config)
     state = rng.standard_normal(3)
     shots: list[Shot] = []
     for k, pose in enumerate(poses):
