@@ -15,10 +15,10 @@ from rich.table import Table
 
 from semantic_mapper.client import UP, MapClient
 from semantic_mapper.config import AtLeastOne, Fraction, nearest_path
-from semantic_mapper.errors import ConfigError, MapError, SemanticMapperError, TransportError
+from semantic_mapper.errors import ConfigError, MapError, TransportError
 from semantic_mapper.labels import PLAIN_NAMES
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.map_file import describe_map, open_map
+from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.mapping.map_types import length_unit
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes import map_answers
@@ -60,22 +60,6 @@ Question = Literal["info", "at", "nearest", "instances", "graph", "changes", "fi
 ARGUMENTS: Mapping[str, str] = {"at": "X Y Z", "nearest": "CLASS X Y Z", "find": "PHRASE", "relocalize": "LOG"}
 
 
-def _classes(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Classes of the map that is named, for `nearest`; nothing where it cannot be read."""
-    if ctx.params["question"] != "nearest" or ctx.params["arguments"]:
-        return []
-    source = ctx.params["source"]
-    try:
-        if is_running_mapper(source):
-            with MapClient(source, timeout_s=1.0, attempts=1) as client:
-                names = client.info().label_set.names
-        else:
-            names = describe_map(map_path(Path(source))).label_set.names
-    except (SemanticMapperError, OSError):
-        return []
-    return [name for name in names if name.startswith(incomplete)]
-
-
 @verb
 def query(
     output: JsonOutput,
@@ -83,7 +67,7 @@ def query(
     source: Annotated[str, typer.Argument(metavar="MAP", autocompletion=complete_launch)],
     question: Question,
     remote: Remote,
-    arguments: Annotated[list[str] | None, typer.Argument(metavar="[ABOUT]", autocompletion=_classes)] = None,
+    arguments: Annotated[list[str] | None, typer.Argument(metavar="[ABOUT]")] = None,
     *,
     up: UpOption = "auto",
     min_confidence: Fraction = 0.0,  # nearest: of the class, at least

@@ -3,7 +3,7 @@
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import typer
@@ -14,7 +14,7 @@ from semantic_mapper.nodes.cli.verb import EXIT_FAILED, OverwriteOption, Setting
 from semantic_mapper.nodes.console import Output, frame_progress
 from semantic_mapper.nodes.launcher.liveness import HeartbeatWriter
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import Recorded, RecorderOptions
+from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder
 from semantic_mapper.nodes.recorder.node import record as record_until_end
@@ -37,10 +37,6 @@ class RecorderSettings(SettingOptions):
     }
 
 
-def _topics(incomplete: str) -> list[str]:
-    return [name for name in get_args(Recorded) if name.startswith(incomplete)]
-
-
 @verb
 def record(
     output: Output,
@@ -50,8 +46,7 @@ def record(
     # its socket folder, or its file's name; by default the one that runs here
     launch: Annotated[str, typer.Option(autocompletion=complete_launch)] = "",
     source: list[str] | None = None,  # node to record; repeated. By default cameras and mappers
-    # repeated. By default info, frame, refused, status; or map
-    topic: Annotated[list[str] | None, typer.Option(autocompletion=_topics)] = None,
+    topic: list[str] | None = None,  # repeated. By default info, frame, refused, status; or map
     duration: AtLeastZero = 0.0,  # seconds; 0 = to the end of the stream, or Ctrl-C
     jpeg: Annotated[int, msgspec.Meta(ge=0, le=100)] = 0,  # quality of colour images; 0 = as they are, lossless
     overwrite: OverwriteOption = False,

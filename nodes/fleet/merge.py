@@ -12,6 +12,7 @@ import numpy as np
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.geometry import check_pose, rotation_vector, yaw_transform
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.map_alignment import AlignmentError, find_alignment
 from semantic_mapper.mapping.map_file import MapManifest, describe_map
 from semantic_mapper.mapping.map_types import require_same_scale
@@ -24,6 +25,7 @@ from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.replay.run_folder import LOG_SUFFIX, MAP_NAME, MAP_SUFFIX, map_path
 from semantic_mapper.types import Float64
 
+_log = get_logger(__name__)
 MEMORY_MB = 1000  # of the merged map, and of the one that is added to it
 _MAX_BLOCKS = 1 << 27
 _WAY_OUT = 'give their poses: --poses FILE, with {"NAME": [x, y, z, yaw_deg], ...}; all 0 where they are in one world'
@@ -91,7 +93,10 @@ def merge_maps(
             waiting = list(refused)
     if len(memory):
         graphs = GraphTracker()
-        graphs.update(MapMirror.of(whole).snapshot(), ())
+        try:
+            graphs.update(MapMirror.of(whole).snapshot(), ())
+        except MapError as error:
+            _log.warning("rooms_not_known", reason=str(error))
         memory.put_in_rooms(graphs.room_of)  # those of the whole
         whole.objects = memory.to_bytes()
     return MergeReport(whole, poses, tuple(notes))

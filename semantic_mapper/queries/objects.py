@@ -402,12 +402,12 @@ def _as_one(pieces: Sequence[MapObject]) -> MapObject:
     """Pieces of one object, the largest first, as it."""
     largest, points = pieces[0], np.concatenate([piece.surface for piece in pieces])
     box, weights = upright_box(points, largest.box.R_world_box), [float(np.prod(p.box.size)) for p in pieces]
-    looks = np.average([p.signature.astype(np.float64) ** 2 for p in pieces], axis=0, weights=weights)
+    looks = np.average([p.signature for p in pieces], axis=0, weights=weights)
     return replace(
         largest,
         box=box,
         color=np.average([p.color for p in pieces], axis=0, weights=weights).astype(np.uint8),
-        signature=np.sqrt(looks).round().astype(np.int8),
+        signature=looks.round().astype(np.int8),
         points=_millimetres(points[:: -(-len(points) // POINTS)] - box.center),
         places=(*largest.places[:-1], replace(largest.places[-1], box=box)),
     )

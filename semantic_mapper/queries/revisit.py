@@ -36,7 +36,6 @@ GONE_FREE = 0.65  # of what is known of its place: a thing of which so much is f
 SHIFTED_FREE = 0.2  # likewise of a thing that may have been moved by less than its size
 LEAST_KNOWN = 0.25  # of its surface
 BY_GRID = 0.77  # weight of free voxels where no view sees through: next to thin boards they are free, too
-LEAST_ODDS = -1.0  # logarithm, of a pair that is taken for one thing
 LEAST_VOXELS, SLIVER_M = 40, (0.03, 0.1)  # of a thing that may have left or come: what has less, or whose two
 # shorter sides are shorter, is often noise
 STANDS = 0.9  # of either of two surfaces that lies at the other one: they are of one thing that stood
@@ -51,14 +50,18 @@ FIT_POINTS, LEAST_FIT, FIT_ROUNDS = 3000, 300, 8
 FIT_TUKEY = 2.5  # voxels
 MOST_FIT_M, MOST_FIT_RAD = 0.08, 0.03
 LEAST_SHIFT_M = 0.06  # things that have been moved by less have not been moved
-CHROMA, LIGHT, DROP = 8, 12, 16  # bins of a signature
-SIGNATURE = CHROMA**2 + LIGHT + DROP
-PARTS = np.cumsum((CHROMA**2, LIGHT))
+CHROMA, OUTLINE, OUTLINE_M, SLICES = 8, 8, (0.05, 0.04), 3  # bins of a signature; down from the top, and outwards
+PARTS = np.cumsum((CHROMA**2, OUTLINE**2))
+SIGNATURE = int(PARTS[-1]) + SLICES
+LIGHT_STEPS = 100.0  # of a signature, of one logarithm of lightness
 HUE_RANGE, DARK = 1.2, 8.0
-LEAST_SIDE_M = 0.04
-FOOT_M = 0.13  # by which the height of one thing may differ: its foot is hidden, or not yet in the map
-# chroma, hue, light, bright, drop, high, level, class
-WEIGHTS, DIFFERENT = np.array((4.3, 0.2, 1.1, 3.2, 4.6, 2.8, 6.8, 0.6)), 3.9
+LEAST_HIGH_M, LEAST_SIDE_M, FOOT_M = (
+    0.02,
+    0.04,
+    0.13,
+)  # by how much the heights of one thing may differ: its foot is hidden
+# chroma, outline, light, bright, high, level, class
+WEIGHTS, DIFFERENT = np.array((7.5, 6.5, 4.3, 3.0, 4.0, 1.0, 4.6)), 5.3
 # Parts of the building, which nobody carries; what is found of them differs from visit to visit.
 FIXTURES = frozenset("window door curtain blinds showercurtain counter bathtub sink toilet".split())
 FACES = np.concatenate((np.zeros((1, 3)), np.eye(3), -np.eye(3)))
@@ -170,76 +173,72 @@ def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) ->
     """Which of those that left are which of those that came, with the probability that they are: at most one each."""
     if not goers or not comers:
         return []
-    looks, cost = _Looks.of(comers), np.empty((len(goers), len(comers)))
+    looks, cost = Looked.of(comers), np.empty((len(goers), len(comers)))
     centers, free = np.array([b.centers for b in comers]), np.array([b.free for b in comers])
     for row, a in enumerate(goers):
         # Of what is seen from another side the one or the other lies elsewhere.
         shift = np.linalg.norm(centers - a.centers, axis=2).min(axis=1)
         near = (shift <= a.size.max()) & (looks.class_id == a.class_id)
         possible = ((shift >= LEAST_SHIFT_M) | a.away) & (near | (np.minimum(a.free, free) >= GONE_FREE))
-        cost[row] = np.where(possible, pair_costs(_Looks.of([a]), looks), np.inf)
-    return [(r, c, _likelihood(cost[r, c])) for r, c in _assign(cost)]
+        cost[row] = np.where(possible, pair_costs(Looked.of([a]), looks), np.inf)
+    against = cost - DIFFERENT  # logarithm of the odds that they are two; no pair is better than one of more than 0
+    found = zip(*scipy.optimize.linear_sum_assignment(np.minimum(against, 0)), strict=True)
+    return [(int(r), int(c), float(1 / (1 + np.exp(against[r, c])))) for r, c in found if against[r, c] < 0]
 
 
-def _likelihood(cost: float) -> float:
-    return float(1 / (1 + np.exp(cost - DIFFERENT)))
+class Looked(NamedTuple):
+    """What N candidates look like, by row."""
 
-
-def _assign(cost: Float64) -> list[tuple[int, int]]:
-    """Pairs of rows and columns of the least total cost, where a row and a column without a pair cost together as one
-    of the least odds."""
-    most = DIFFERENT - LEAST_ODDS
-    found = zip(*scipy.optimize.linear_sum_assignment(np.minimum(cost - most, 0)), strict=True)
-    return [(int(r), int(c)) for r, c in found if cost[r, c] < most]
-
-
-class _Looks(NamedTuple):
-    """Of N candidates, by row: histograms of unit length of ``signature_of``, one tone, sizes, and class."""
-
-    parts: Sequence[Float64]
-    hue: Float64  # (N, 2)
-    lightness: Float64  # (N,)
+    chroma: Float64  # (N, CHROMA**2) of unit length
+    outline: Float64  # (N, OUTLINE**2) of unit length
+    light: Float64  # (N, SLICES)
+    bright: Float64  # (N,) lightness
+    height: Float64  # (N,) metres
     level: Float64  # (N, 2) logarithms of the shorter and the longer side
-    height: Float64  # (N,)
     class_id: Int64  # (N,)
 
     @classmethod
-    def of(cls, things: Sequence[Candidate]) -> _Looks:
-        size = np.array([c.size for c in things])
-        parts = np.split(np.array([c.signature for c in things]) / 127, PARTS, axis=1)
-        tone = _tone(np.array([c.color for c in things]))
+    def of(cls, things: Sequence[Candidate]) -> Looked:
+        """What these look like."""
+        *parts, light = np.split(np.array([c.signature for c in things], np.float64), PARTS, axis=1)
+        chroma, outline = (h / np.maximum(np.linalg.norm(h, axis=1, keepdims=True), 1) for h in parts)
+        _, bright = _tone(np.array([c.color for c in things]))
+        size, class_id = np.array([c.size for c in things]), np.array([c.class_id for c in things])
         level = np.log(np.maximum(np.sort(size[:, :2]), LEAST_SIDE_M))
-        return cls(parts, *tone, level, size[:, 2], np.array([c.class_id for c in things]))
+        return cls(chroma, outline, light / LIGHT_STEPS, bright, size[:, 2], level, class_id)
 
 
-def pair_costs(a: _Looks, b: _Looks) -> Float64:
+def pair_costs(a: Looked, b: Looked) -> Float64:
     """How different one thing and others (N,) look: the logarithm of the odds of being one is ``DIFFERENT`` less this
-    (N,). The weights are of a logistic regression over homes that no figure is of."""
-    chroma, light, drop = (1 - (x * y).sum(axis=1) for x, y in zip(a.parts, b.parts, strict=True))
-    hue, bright = np.linalg.norm(a.hue - b.hue, axis=1), np.abs(a.lightness - b.lightness)
-    level = np.abs(a.level - b.level).mean(axis=1)
+    (N,). The weights are of a conditional logistic regression (which of those that came is it, or none) over homes that
+    no figure is of; those of sizes are larger, since most things there are small."""
+    chroma, outline = (1 - (x * y).sum(axis=1) for x, y in ((a.chroma, b.chroma), (a.outline, b.outline)))
+    light, bright = np.abs(a.light - b.light).mean(axis=1), np.abs(a.bright - b.bright)
     high = np.maximum(0.0, np.abs(a.height - b.height) - FOOT_M) / np.maximum(np.maximum(a.height, b.height), 0.1)
-    return WEIGHTS @ np.array((chroma, hue, light, bright, drop, high, level, a.class_id != b.class_id))
+    level = np.abs(a.level - b.level).mean(axis=1)
+    return WEIGHTS @ np.array((chroma, outline, light, bright, high, level, a.class_id != b.class_id))
 
 
 def signature_of(snapshot: MapSnapshot, thing: Instance, up: Float64) -> NDArray[np.int8]:
-    """(SIGNATURE,) int8: three histograms of unit length, times 127: of hue and saturation, of lightness against its
-    median, and of depths below its top (its foot is often hidden)."""
+    """(SIGNATURE,) int8: histograms of hue and saturation, and of how far its surface is below its top and from its
+    upright axis, of unit length, times 127; and the median lightness of thirds of its height against that of all."""
     points, slot, voxel = read_thing(snapshot, thing)
     hue, lightness = _tone(snapshot.voxels.rgb[slot, voxel])
     at = np.clip((hue / HUE_RANGE + 0.5) * CHROMA - 0.5, 0, CHROMA - 1.001)
     low = np.floor(at).astype(np.int64)
-    part = at - low
-    chroma = np.zeros((CHROMA, CHROMA))
+    near = at - low
+    chroma, outline = np.zeros((CHROMA, CHROMA)), np.zeros((OUTLINE, OUTLINE))
     for x, y in np.ndindex(2, 2):  # each is shared by the four bins round it
-        np.add.at(chroma, (low[:, 0] + x, low[:, 1] + y), np.abs(1 - x - part[:, 0]) * np.abs(1 - y - part[:, 1]))
-    height = points @ up
-    histograms = (
-        chroma.ravel(),
-        _histogram((lightness - np.median(lightness) + 1.2) / 0.2, LIGHT),
-        _histogram((np.percentile(height, 99) - height) / 0.06, DROP),
-    )
-    return np.concatenate([np.sqrt(h / max(1.0, h.sum())) * 127 for h in histograms]).round().astype(np.int8)
+        np.add.at(chroma, (low[:, 0] + x, low[:, 1] + y), np.abs(1 - x - near[:, 0]) * np.abs(1 - y - near[:, 1]))
+    height, offset = points @ up, points - thing.box.center
+    top, foot, middle = float(np.percentile(height, 99)), float(height.min()), np.median(lightness)
+    aside = np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)
+    bins = np.clip(np.stack((top - height, aside)) / np.array(OUTLINE_M)[:, None], 0, OUTLINE - 1).astype(np.int64)
+    np.add.at(outline, tuple(bins), 1)
+    third = np.clip((height - foot) / max(top - foot, LEAST_HIGH_M) * SLICES, 0, SLICES - 1).astype(np.int64)
+    light = [np.median(lightness[third == k]) - middle if (third == k).any() else 0.0 for k in range(SLICES)]
+    histograms = [np.sqrt(h.ravel() / max(1.0, h.sum())) * 127 for h in (chroma, outline)]
+    return np.clip(np.concatenate((*histograms, np.array(light) * LIGHT_STEPS)), -127, 127).round().astype(np.int8)
 
 
 def color_of(snapshot: MapSnapshot, thing: Instance) -> UInt8:
@@ -252,10 +251,6 @@ def _tone(rgb: NDArray[np.generic]) -> tuple[Float64, Float64]:
     """Hue and saturation (N, 2) and lightness (N,) of colours (N, 3), as logarithms: other light shifts them."""
     log = np.log(rgb.astype(np.float64) + DARK)
     return np.stack((log[:, 0] - log[:, 1], log[:, 2] - log[:, 1]), axis=1), log.mean(axis=1)
-
-
-def _histogram(values: Float64, bins: int) -> Int64:
-    return np.bincount(np.clip(np.floor(values), 0, bins - 1).astype(np.int64), minlength=bins)
 
 
 def read_thing(snapshot: MapSnapshot, thing: Instance) -> tuple[Float64, Int64, Int64]:
@@ -338,17 +333,13 @@ def parted(
 
 
 def stands(visit: MapVisit, class_id: int, points: Float64) -> bool:
-    """Whether most of points (N, 3) lie so near to things of a class that they have not been moved."""
-    size, low, high = (
-        visit.snapshot.voxel_size_m,
-        points.min(axis=0) - LEAST_SHIFT_M,
-        points.max(axis=0) + LEAST_SHIFT_M,
+    """Whether most of points (N, 3) lie so near to a thing of a class that they have not been moved."""
+    kin = (
+        thing.voxels.astype(np.float64) * visit.snapshot.voxel_size_m
+        for thing in visit.things
+        if thing.class_id == class_id
     )
-    surfaces = [thing.voxels * size for thing in visit.things if thing.class_id == class_id]
-    near = [xyz[((xyz >= low) & (xyz <= high)).all(axis=1)] for xyz in surfaces]
-    if not any(map(len, near)):
-        return False
-    return bool(np.mean(scipy.spatial.KDTree(np.concatenate(near)).query(points)[0] < LEAST_SHIFT_M) > 0.5)
+    return any(_share_near(points, surface) > 0.5 for surface in kin)
 
 
 def _piece(thing: Instance, xyz: Float64, rows: Int64, up: Float64) -> Instance:
@@ -419,11 +410,16 @@ def _reach(tree: Any) -> float:
 
 def lies_along(before: Float64, now: Float64) -> bool:
     """Whether of two surfaces, points (N, 3), one lies at the other: what was seen in part has not moved."""
-    apart = np.maximum(before.min(axis=0) - now.max(axis=0), now.min(axis=0) - before.max(axis=0))
-    if (apart > LEAST_SHIFT_M).any():
-        return False
-    within = (np.mean(scipy.spatial.KDTree(a).query(b)[0] < LEAST_SHIFT_M) for a, b in ((before, now), (now, before)))
-    return bool(max(within) > STANDS)
+    return max(_share_near(before, now), _share_near(now, before)) > STANDS
+
+
+def _share_near(points: Float64, surface: Float64) -> float:
+    """Which part of points (N, 3) is nearer than ``LEAST_SHIFT_M`` to any of a surface (M, 3)."""
+    low, high = points.min(axis=0) - LEAST_SHIFT_M, points.max(axis=0) + LEAST_SHIFT_M
+    there = surface[((surface >= low) & (surface <= high)).all(axis=1)]
+    if not len(there):
+        return 0.0
+    return float(np.mean(scipy.spatial.KDTree(there).query(points)[0] < LEAST_SHIFT_M))
 
 
 def may_go(box: OrientedBox, voxels: int) -> bool:

@@ -163,7 +163,7 @@ def answers() -> dict[str, Any]:
     voxels = np.array([[1, 2, 3], [4, 5, -6]], np.int32)
     thing = Instance(4, 9, "counter top", 0.75, rng.random(3), box, voxels)
     place = ObjectPlace(3, box, 2)
-    looks = rgb[0], np.arange(SIGNATURE, dtype=np.int8), np.array([[5, -6, 700]], np.int16)
+    looks = rgb[0], np.arange(SIGNATURE).astype(np.int8), np.array([[5, -6, 700]], np.int16)
     remembered = MapObject(4, 9, "counter top", ((9, 0.75),), box, *looks, 3, 8, 2, 2, (place,), certainty=0.5)
     changes = BlockChanges(
         since=3,

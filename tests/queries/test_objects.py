@@ -31,13 +31,20 @@ from semantic_mapper.queries.objects import (
 )
 from semantic_mapper.queries.revisit import (
     GONE_FREE,
+    PARTS,
+    SIGNATURE,
     Candidate,
     Evidence,
+    Looked,
     Looks,
     MapVisit,
+    color_of,
     lies_along,
     match_candidates,
     may_go,
+    pair_costs,
+    read_thing,
+    signature_of,
     stands,
     touching,
 )
@@ -165,7 +172,7 @@ def test_pieces_of_one_class_that_nearly_touch_are_one_thing() -> None:
 
 
 def test_a_thing_seen_from_another_side_has_not_moved() -> None:
-    signature = np.repeat(np.array((16, 37, 32), np.int8), (64, 12, 16))  # each histogram of unit length
+    signature = np.full(SIGNATURE, 9, np.int8)
 
     def seen(surface: float, box: float) -> Candidate:
         centers = np.array(((surface, 0, 0), (box, 0, 0)))
@@ -176,15 +183,31 @@ def test_a_thing_seen_from_another_side_has_not_moved() -> None:
 
 
 def test_of_two_that_left_the_more_alike_is_the_one_that_came() -> None:
-    signature = np.repeat(np.array((16, 37, 32), np.int8), (64, 12, 16))
-
-    def seen(x: float, side: float) -> Candidate:
+    def seen(x: float, hue: int, high: int) -> Candidate:
+        signature = np.zeros(SIGNATURE, np.int8)
+        signature[[hue, hue + 1, PARTS[0] + high, PARTS[0] + high + 1]] = 90
         place = np.array((x, 0, 0)) * np.ones((2, 1))
-        return Candidate(5, np.array((side, side, 0.4)), place, 0.9, signature, np.zeros(3, np.uint8))
+        return Candidate(5, np.full(3, 0.4), place, 0.9, signature, np.zeros(3, np.uint8))
 
-    found = match_candidates([seen(0, 0.4), seen(1, 0.5), seen(2, 2.0)], [seen(5, 0.5), seen(9, 0.9)])
+    found = match_candidates([seen(0, 0, 1), seen(1, 0, 2), seen(2, 9, 7)], [seen(5, 0, 2), seen(9, 30, 50)])
     assert [pair[:2] for pair in found] == [(1, 0)] and found[0][2] > 0.9
-    assert not match_candidates([], [seen(5, 0.5)]) and not match_candidates([seen(5, 0.5)], [])
+    assert not match_candidates([], [seen(5, 0, 0)]) and not match_candidates([seen(5, 0, 0)], [])
+
+
+def test_a_signature_tells_where_it_is_light_and_how_wide_it_is() -> None:
+    def looks(desk: Box, *, upside_down: bool = False) -> Candidate:
+        made = visit([*two_rooms(), desk], 10)
+        (thing,) = [t for t in made.things if t.box.center[0] < 2]
+        _, slot, voxel = read_thing(made.snapshot, thing)
+        is_top = (thing.voxels[:, 2] * VOXEL_M > 0.5) != upside_down
+        made.snapshot.voxels.rgb[slot, voxel] = np.where(is_top[:, None], (220, 220, 220), (60, 60, 60))
+        signature = signature_of(made.snapshot, thing, UP)
+        return Candidate(5, thing.box.size, np.zeros((2, 3)), 0.9, signature, color_of(made.snapshot, thing))
+
+    desk, again = looks(box(DESK, 0.6, 0.6)), looks(box((0.4, 0.6, 0.9), 1.2, 0.6))  # turned by a quarter
+    turned, wide = looks(box(DESK, 0.6, 0.6), upside_down=True), looks(box((1.2, 1.0, 0.9), 0.3, 0.2))
+    same, light, outline = (pair_costs(Looked.of([desk]), Looked.of([o]))[0] for o in (again, turned, wide))
+    assert same < 1 and light > 2 and outline > 2
 
 
 def test_points_far_from_the_middle_of_a_thing_stay_where_they_can_be_kept() -> None:
