@@ -42,8 +42,7 @@ def read_live(client: MapClient) -> MapNow:
 
 
 class MapTools:
-    """The tools: each public method is one, with its docstring as what agents read. All raise MapError: nothing fits,
-    or as of ``find``."""
+    """The tools: public methods, with docstrings for agents. All raise MapError: as of ``find``, or nothing fits."""
 
     def __init__(self, read: Callable[[], MapNow]) -> None:
         self._read = read

@@ -115,8 +115,7 @@ def table(
     numbers: Collection[str] = (),
 ) -> Table:
     """A table for ``Output.print``, of cells (None is an empty one), names of the columns (without any the first column
-    names the rows), and which of these are of ``numbers``, that end at the right. Named columns whose cells are all
-    empty are left out."""
+    names the rows), and which of these are of ``numbers``, that end at the right. Empty named columns are left out."""
     found = Table(title=title, caption=caption, title_justify="left", show_header=bool(names), box=SIMPLE_HEAD)
     found.show_edge, found.pad_edge, found.padding = False, False, (0, 1, 0, 0)
     cells = [["" if cell is None else cell if isinstance(cell, Text) else str(cell) for cell in row] for row in rows]

@@ -41,8 +41,7 @@ class NodeContext:
         return name if "://" in name else self.endpoints.get(name) or default_endpoint(name)
 
     def leave_note(self, what: str, text: str) -> None:
-        """Leave word to the process that takes over when this one is killed; in a launch only. ``OSError`` where it
-        cannot be written."""
+        """Leave word to the process that takes over when this one is killed, in a launch. ``OSError``: it cannot be."""
         if self.folder is not None:
             write_bytes(self.folder / f"{self.name}.{what}.note", text.encode(), sync="none")
 

@@ -148,8 +148,7 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path, source: str) -
 
 
 def _read_all(entries: list[Any], as_json: Callable[[Any], Any], path: Path) -> tuple[Primitive, ...]:
-    """Boxes of the entries of a file; ``as_json`` gives what ``boxes.json`` would say of one. Raises ConfigError: some
-    cannot be used."""
+    """Boxes of the entries of a file; ``as_json`` gives what ``boxes.json`` would say. Raises ConfigError: bad ones."""
     good: list[Primitive] = []
     bad: list[str] = []
     first: dict[int, int] = {}

@@ -384,8 +384,7 @@ class PseudoLabels:
         return replace(frame, label=label, label_is_pseudo=True)
 
     def of_map(self, frame: PosedFrame) -> PosedFrame:
-        """A frame, once ``of`` has seen all, with the labels of the map, and its own where the map has none: many views
-        err less than one."""
+        """A frame, once ``of`` has seen all, with the labels of the map, else its own: many views err less."""
         if self.mapper is None or frame.label is None:
             return frame
         seen = self.mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label

@@ -46,8 +46,7 @@ class Section:
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
-    """Write a page, whole or not at all; sections with nothing but a heading are left out. Raises ConfigError: it
-    cannot be written."""
+    """Write a page, whole or not at all; empty sections are left out. Raises ConfigError: it cannot be written."""
     pages = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,

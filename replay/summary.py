@@ -45,8 +45,7 @@ def figures_table(
     by_name: Sequence[tuple[str, str, Callable[[Any], str]]],
 ) -> Table:
     """One column a record, by its name. ``rows`` are a head, the dotted place of a value and how it is shown; those of
-    ``by_name`` are a head and the place of values with names of their own, a row each. Rows without a value are left
-    out."""
+    ``by_name`` are a head and the place of values with names of their own, a row each. Empty rows are left out."""
     table = Table("", title=title, title_justify="left")
     for name in records:
         table.add_column(name, justify="right")
@@ -73,8 +72,7 @@ def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def ending(summary: Mapping[str, Any], out: Path) -> list[str]:
-    """What became of a run, what to know of it, and where its pictures and its map are, a line each; the report has
-    the other figures."""
+    """What became of a run, what to know of it, where pictures and map are, a line each; the report has more."""
     ms, unknown, scored = (dig(summary, path) for path in ("latency_ms.p50", "map.unknown", "metrics.miou"))
     mapped = f"{summary['frames']['fused']} of {counted(summary['frames']['published'], 'frame')}"
     times = "" if ms is None else f", {_ms(ms)} each (p95 {_ms(dig(summary, 'latency_ms.p95'))})"

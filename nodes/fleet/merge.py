@@ -150,8 +150,7 @@ def read_poses(path: Path) -> dict[str, Float64]:
 
 
 def _empty_map(manifests: Mapping[str, MapManifest]) -> VoxelMap:
-    """With the settings of the first map and room for all. Raises MapError: two maps are the same, or only some are in
-    metres."""
+    """With the settings of the first map and room for all. Raises MapError: two are one, or some have no metres."""
     seen: dict[bytes, str] = {}
     first_name, first = next(iter(manifests.items()))
     for name, manifest in manifests.items():

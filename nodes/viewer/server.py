@@ -170,8 +170,7 @@ def end_process(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def _hold_port(port: int | None, usual: int) -> Iterator[int]:
-    """The port itself where it is free, a free one for 0, and for None the usual one where it is free; nobody else gets
-    it meanwhile."""
+    """The port itself where it is free, a free one for 0, for None the usual one where it is free; kept from others."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

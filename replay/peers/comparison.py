@@ -61,8 +61,7 @@ PEERS = {
 
 
 def read_frames(log: Path, count: int) -> tuple[list[PosedFrame], LabelSet | None]:
-    """The first frames with depth of the first camera of a log, and the label set of their labels. Raises LogError:
-    there are too few."""
+    """The first frames with depth of the first camera of a log, and their label set. Raises LogError: too few."""
     with LogReader(log) as reader:
         with_depth = (frame for frame in reader if frame.depth_m is not None)
         first = next(with_depth, None)

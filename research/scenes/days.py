@@ -64,8 +64,8 @@ class DayChange:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Home:
-    """Rooms on one day, each in its own axes; ``offsets`` (R, 3) are their places in the world. ``camera`` is the
-    number of the robot's camera, which has one look (contrast, saturation, lens) in all rooms and on all days."""
+    """Rooms on one day, each in its own axes, at ``offsets`` (R, 3) in the world. The robot's ``camera`` has one look
+    (contrast, saturation, lens) in all rooms and on all days."""
 
     rooms: tuple[Scene, ...]
     offsets: Float64
@@ -107,15 +107,8 @@ def visit(
             middle = np.eye(4)
             middle[:3, 3] = np.array(scene.size_m) / 2
             known = middle @ errors[number] @ np.linalg.inv(middle) @ poses
-        views = render_views(
-            1_000_003 * seed + number,
-            [scene] * len(poses),
-            poses,
-            intrinsics,
-            noise=noise,
-            frame_poses=known,
-            camera=home.camera,
-        )
+        of_room, scenes = 1_000_003 * seed + number, [scene] * len(poses)
+        views = render_views(of_room, scenes, poses, intrinsics, noise=noise, frame_poses=known, camera=home.camera)
         for view in views:
             T, T_true = view.frame.T_world_camera.copy(), view.T_world_camera.copy()
             T[:3, 3] += offset

@@ -27,8 +27,7 @@ MOSTLY_VOID = 0.5  # of a found segment: more, and it counts as nothing
 
 
 class PanopticImage(NamedTuple):
-    """Class ids (H, W) uint8, and the number (H, W) of the object of each pixel, 0 = none; numbers of stuff do not
-    matter."""
+    """Class ids (H, W) uint8, and the number (H, W) of each pixel's object, 0 = none; those of stuff do not matter."""
 
     label: UInt8
     instance: NDArray[np.integer[Any]]

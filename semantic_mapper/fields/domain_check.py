@@ -25,9 +25,8 @@ _log = get_logger(__name__)
 
 
 class DomainCheck:
-    """Judges the pictures that a ``field`` encodes; changes nothing. ``pictures`` were judged, ``unlike`` of them are
-    unlike those of the training, whose features have this ``mean`` (D,). ``whiten`` (D, D) makes the covariance of
-    these one over D."""
+    """Judges the pictures that a ``field`` encodes; changes nothing. ``pictures`` were judged, ``unlike`` are unlike
+    those of the training, whose features have this ``mean`` (D,); ``whiten`` (D, D) makes their covariance 1/D."""
 
     def __init__(self, field: StreamingSRay, mean: Float32, whiten: Float32) -> None:
         self._field, self._mean, self._whiten = field, mean, whiten

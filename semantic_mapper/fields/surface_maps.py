@@ -1,7 +1,6 @@
 """The geocentric encoding of depth (Gupta et al., ECCV 2014): what an encoder sees of a measured surface.
 
-Inverse depth, height above the lowest point in view, and the angle of the surface to gravity, which is found in each
-image by itself."""
+Inverse depth, height above the lowest point in view, and the angle of the surface to gravity, found by each image."""
 
 import math
 

@@ -225,8 +225,7 @@ def parallel_kernel(chunks_per_thread: int = 1) -> Callable[[Callable[Concatenat
 
     The declaration's first argument is the number of iterations; C gets a range of them as ``start`` and ``stop``, and
     returns 0, or 1 where it lacks memory, which raises MemoryError. Iterations must not depend on each other: the
-    result is the same to the bit for any number of threads. ``chunks_per_thread``: more than 1 where iterations differ
-    in cost."""
+    result is the same to the bit for any number of threads. ``chunks_per_thread``: above 1 where costs differ."""
 
     def decorate(declaration: Callable[Concatenate[int, P], None]) -> ParallelKernel[P]:
         return ParallelKernel(Kernel(declaration, skip=1), chunks_per_thread)

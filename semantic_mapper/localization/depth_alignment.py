@@ -85,8 +85,7 @@ def compare(
     level: Level, target: Level, T_target_camera: Float64, outlier_m: float = OUTLIER_M, noise_m: float = np.inf
 ) -> Fit:
     """How a view lies on another one, at one size, from a pose ``T_target_camera`` (4, 4). Points further than
-    ``outlier_m`` from the surface do not count; distances beyond ``noise_m``, of depth at 1 m, count less in the normal
-    matrix."""
+    ``outlier_m`` from the surface do not count; distances beyond ``noise_m``, of depth at 1 m, count less."""
     matrix, gradient, sums = np.empty((6, 6)), np.empty(6), np.empty(9)
     lens = np.array((target.intrinsics.fx, target.intrinsics.fy, target.intrinsics.cx, target.intrinsics.cy))
     pose, limits = np.ascontiguousarray(T_target_camera), (outlier_m, noise_m)

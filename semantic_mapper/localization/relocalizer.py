@@ -253,8 +253,7 @@ class Relocalizer:
         return None
 
     def _class_agreement(self, tried: _Tried, label: UInt8) -> float:
-        """Fraction of pixels of the map's class, among those where both are sure and the depth agrees; NaN where there
-        are hardly any."""
+        """Fraction of pixels of the map's class, where both are sure and the depth agrees; NaN: hardly any."""
         view = tried.view
         height, width = view.label.shape
         own = np.asarray(cv2.resize(label, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -431,8 +430,7 @@ def find_consensus(seen: Sequence[Sighting]) -> Consensus:
 
 
 def agreed(agreeing: Sequence[Sighting]) -> Float64:
-    """T_map_world (4, 4) that fits all of those that agree best, far ones less: it takes what their cameras look at
-    there."""
+    """T_map_world (4, 4) that fits all of those that agree best, far ones less: it takes what their cameras see."""
     old = np.concatenate([transform(s.T_world_camera, _LOOKED_AT) for s in agreeing])
     new = np.concatenate([transform(s.T_map_world @ s.T_world_camera, _LOOKED_AT) for s in agreeing])
     weights = np.ones(len(agreeing))

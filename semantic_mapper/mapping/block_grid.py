@@ -266,8 +266,7 @@ class BlockGrid:
         return values
 
     def pack(self, packed: Int64) -> Iterator[tuple[Int64, PackedBlocks]]:
-        """A packed copy of existing blocks (B,), part by part, first those in memory: positions in ``packed`` (P,), and
-        blocks."""
+        """A packed copy of existing blocks (B,), in parts, those in memory first: rows of ``packed`` (P,), blocks."""
         found = find_blocks(self._index, packed)
         here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
         yield here, pack_blocks(self._buffers.values, found[here])

@@ -82,8 +82,7 @@ def clear_in_view(
     grid: BlockGrid, band: Int64, scene: Scene, bounds: DepthBounds, version: int
 ) -> Iterator[tuple[Int64, Int64]]:
     """Clear what a frame with a sensor's depth sees through outside of the truncation ``band`` (B,), sorted packed
-    keys, in place, under the map's lock: packed keys (B,) of blocks that changed, which get ``version``, and voxels
-    cleared in each."""
+    keys, in place, under the map's lock: keys (B,) of changed blocks, which get ``version``, and voxels of each."""
     packed = _candidates(grid, band, scene, bounds)
     for start in range(0, len(packed), grid.room):
         part = packed[start : start + grid.room]

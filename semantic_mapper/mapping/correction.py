@@ -145,8 +145,7 @@ class MapCorrector:
 
     ``lock`` is held by a step, by a frame of a rebuild, and where the maps are exchanged. ``voxel_map`` and
     ``keyframes`` move with their frames at the end of a rebuild. ``fuse`` integrates a frame of the history and its
-    rendered view (h, w) into the map given; ``on_move`` is called when a correction begins, and when the map has
-    moved."""
+    rendered view (h, w) into the map given; ``on_move`` is called when one begins, and when the map has moved."""
 
     def __init__(
         self,

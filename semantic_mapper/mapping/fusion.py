@@ -5,8 +5,7 @@ the pixel a voxel projects to: one vote a voxel a frame, only near the surface. 
 frontal looks more; see ``make_votes``. The result does not depend on threads.
 
 Depth of a sensor weighs ``MEASURED`` in the TSDF; computed depth at most ``COMPUTED_LOOK``, and all of it together at
-most ``COMPUTED_CAP``: so the weight of a voxel says whether its surface was measured. Computed depth never changes what
-was measured."""
+most ``COMPUTED_CAP``: so the weight of a voxel says whether its surface was measured. It changes nothing measured."""
 
 from __future__ import annotations
 

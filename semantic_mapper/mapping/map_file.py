@@ -153,8 +153,7 @@ def write_map(
     path: Path, manifest: MapManifest, parts: Iterable[BlockPart], places: Sequence[Place] = (), objects: bytes = b""
 ) -> MapManifest:
     """Write a map in one step; returns the manifest with what depends on the blocks filled in. ``parts`` are blocks in
-    lexicographic order, ``CHUNK_BLOCKS`` at a time. ``MapError``: it cannot be written; a file from before is
-    untouched."""
+    lexicographic order, ``CHUNK_BLOCKS`` at a time. ``MapError``: it cannot be; a file from before stays."""
     chunks: list[MapChunk] = []
     corners: list[Int32] = []
     try:
@@ -229,8 +228,7 @@ class MapReader:
             del values  # while the next ones are read
 
     def changes(self) -> Iterator[BlockChanges]:
-        """What ``VoxelMap.changes(0)`` of the loaded map gives, in parts, in memory for one; each completes the map's
-        version."""
+        """What ``VoxelMap.changes(0)`` of the loaded map gives, in parts, one in memory; each ends at its version."""
         saved, config, parts = self.manifest, self.manifest.config, self.parts()
         decision = Decision(config.vote_discount, config.unknown_below, SURFACE_WEIGHT)
         for start in range(0, max(len(saved.chunks), 1), _CHUNKS_AT_ONCE):

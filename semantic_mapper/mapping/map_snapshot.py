@@ -57,8 +57,7 @@ class FrozenMap:
         _log.info("map_saved", path=str(path), frames=manifest.frames, blocks=manifest.blocks, bytes=size)
 
     def parts(self, between: Callable[[], object] = lambda: None, *, last: bool = False) -> Iterator[BlockPart]:
-        """All blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time; copies go as they are read where it is the
-        ``last`` time."""
+        """All blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time; the ``last`` time, copies go when read."""
         for start in range(0, len(self._keys), CHUNK_BLOCKS):
             packed = self._keys[start : start + CHUNK_BLOCKS]
             with self._lock:

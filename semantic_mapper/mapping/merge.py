@@ -113,8 +113,7 @@ def _parts(pairs: Int64) -> Iterator[tuple[Int64, Int64]]:
 def _resample_blocks(
     count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
 ) -> None:
-    """Interpolate a source at voxels of other blocks (B, 3): their point p is the source's ``R @ (p - t)`` in
-    voxels."""
+    """Interpolate a source at voxels of other blocks (B, 3): p is the source's ``R @ (p - t)``, voxels."""
 
 
 @parallel_kernel()

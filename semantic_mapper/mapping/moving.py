@@ -355,8 +355,7 @@ def depth_slopes(depth_m: Float32) -> Float32:
 
 
 def align_pose(points: Float32, T_world_camera: Float64, views: Sequence[SeenView]) -> Alignment:
-    """Correct a pose (4, 4) by what views of one size saw, given points (N, 3) that the frame measured, in its
-    camera."""
+    """Correct a pose (4, 4) by what views of one size saw, by points (N, 3) that the frame measured, in its camera."""
     T, moved, misfit = T_world_camera, np.zeros(6), np.inf
     prior = np.repeat((SIGMA_M**-2, SIGMA_RAD**-2), 3)
     for cut in CUTS:

@@ -146,8 +146,7 @@ class MappingPipeline:
         """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first: one frame
         each, unless ``depth.from_motion.delay_frames`` lets frames wait.
 
-        ``FrameError``: its picture cannot be mapped, such as a dark or blurred one. ``PoseError``: no rigid
-        transform."""
+        ``FrameError``: its picture cannot be mapped, dark or blurred. ``PoseError``: no rigid transform."""
         return self.frame_depth.push(frame)
 
     def prepare_rest(self) -> list[PosedFrame]:

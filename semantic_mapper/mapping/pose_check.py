@@ -97,8 +97,7 @@ class PoseCheck:
 
     @property
     def contradicting(self) -> float | None:
-        """Fraction of the newest pairs of which one sees through what the other measures; None while too few
-        overlap."""
+        """Fraction of the newest pairs of which one sees through what the other measures; None: too few overlap."""
         if self.compared < MIN_KEYFRAMES or len(self._pairs) < MIN_PAIRS:
             return None
         return float(np.mean(np.array(self._pairs) > SEEN_THROUGH))
@@ -124,8 +123,7 @@ class PoseCheck:
             _log.warning("poses_stand_still", seq=frame.seq, camera=frame.camera_id, reason=self.warning)
 
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
-        """Compare a new keyframe with ``sources``, which see most of what it sees, the best first, and others, oldest
-        first."""
+        """Compare a new keyframe with ``sources``, which see most of what it sees, best first; others oldest first."""
         self._measured = {_key(new), *self._measured.intersection(map(_key, keyframes))}
         near = [k for k in sources if not k.labelled][:PARTNERS]
         if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in near):

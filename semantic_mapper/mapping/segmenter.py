@@ -100,8 +100,7 @@ class Opinion(NamedTuple):
 class Segmenter:
     """A model and the answer that it gave last. Deterministic.
 
-    Raises ConfigError: the table or the model is missing or invalid, or none of its classes is in ``label_set`` and
-    none moves."""
+    Raises ConfigError: the table or the model is missing or invalid, or no class is in ``label_set`` and none moves."""
 
     def __init__(self, config: SegmenterConfig, label_set: LabelSet) -> None:
         path = Path(config.table)

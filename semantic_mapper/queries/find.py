@@ -320,8 +320,7 @@ def render(snapshot: MapSnapshot, T_world_camera: Float64, width: int = 320, fov
 
 
 def picture_of(snapshot: MapSnapshot, found: FoundObject, up: Float64, width: int = 320) -> UInt8:
-    """A crop (H, W, 3) uint8 round an object and its box, seen from where ``found`` says, or from above the side that
-    was seen."""
+    """A crop (H, W, 3) uint8 round an object and its box, from where ``found`` says, or over the side that was seen."""
     box = found.object.box
     size = float(np.linalg.norm(box.size))
     T = found.T_world_camera

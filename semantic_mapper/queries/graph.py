@@ -124,8 +124,7 @@ class GraphTracker:
             return () if self._things is None else self._things.gone
 
     def up_in(self, snapshot: MapSnapshot) -> Float64:
-        """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet, else
-        ``MapError``."""
+        """Unit vector up (3,) in the world, found by the floor of this map at first; else ``MapError``."""
         with self._lock:
             if self._up is None:
                 self._up = up_in(snapshot)

@@ -128,8 +128,7 @@ class _Rows(msgspec.Struct, frozen=True, array_like=True):
 class ObjectMemory:
     """The objects of one map, by id; those that have gone, too.
 
-    Beyond ``MAX_OBJECTS`` those that went first are forgotten, then those seen least. Raises MapError: an id that comes
-    twice."""
+    Beyond ``MAX_OBJECTS``, first gone are first forgotten, then those seen least. MapError: an id comes twice."""
 
     def __init__(self, objects: Iterable[MapObject] = (), next_id: int = 1, last_ns: int = NEVER_NS) -> None:
         self._objects: dict[int, MapObject] = {}

@@ -5,8 +5,7 @@ one has an array, its header says ``{dtype, shape, start, bytes}``: its elements
 the third part from ``start`` on; of single bytes, a zstd frame.
 
 Header of a question: its fields. Of an answer: ``map`` (``MapState``) and ``answer``. In the place of an answer may
-come an error, ``["error", header]``. Sizes are checked before anything is allocated; what is wrong is a
-``CodecError``."""
+come an error, ``["error", header]``. Sizes are checked before they are allocated, else ``CodecError``."""
 
 import math
 from dataclasses import dataclass

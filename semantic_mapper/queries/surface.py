@@ -1,8 +1,7 @@
 """The surface: its voxels, each with one point of it, and what a ray meets.
 
 A zero crossing of the TSDF on the edge between two observed voxels belongs to the nearer of the two (half way: to the
-lower). The mean of a voxel's crossings is its surface point, which has the class, confidence and colour of the
-voxel."""
+lower). The mean of a voxel's crossings is its surface point, which has class, confidence and colour of the voxel."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -57,8 +56,7 @@ def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
 
 
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
-    """Surface points in a box with corners (3,), world metres, one a voxel, in a fixed order; ``MapError``: a bad
-    box."""
+    """Surface points in a box with corners (3,), world metres, one a voxel, in fixed order; ``MapError``: a bad box."""
     low, high = checks.check_box(lower, upper, snapshot)
     surface = surface_voxels(snapshot, checks.rows_in_box(snapshot, low, high))
     inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
@@ -98,8 +96,7 @@ def costmap(
 def collect_surface_voxels(
     keys: Int32, slots: Int32, index: BlockIndex, voxels: BlockVoxels, counts: Int64, voxel: Int32, point: Float64
 ) -> int:
-    """Write ``voxel`` (512 B,) and ``point`` (512 B, 3) of ``SurfaceVoxels``, as many as it returns, and how many each
-    block has (B,)."""
+    """Write ``voxel`` (512 B,), ``point`` (512 B, 3) of ``SurfaceVoxels``, as many as it returns, ``counts`` (B,)."""
     ...
 
 

@@ -245,8 +245,7 @@ class _BalancedPixels:
 
 
 def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor, near_m: float) -> None:
-    """Give a field the labels (F H W,) of frames, with the depth at which they are: measured, else rendered from
-    ``near_m`` on."""
+    """Give a field the labels (F H W,) of frames, with their depth: measured, else rendered from ``near_m`` on."""
     carried = field.carried
     if carried is None:
         return

@@ -85,8 +85,7 @@ def make_keys(folder: Path) -> Keys:
 
 
 def load_keys(folder: Path) -> Keys:
-    """The keys of this machine; ``TransportError`` where they are missing or damaged, or others could read the secret
-    one."""
+    """The keys of this machine; ``TransportError`` where they are missing or damaged, or others could read a secret."""
     path = folder / f"{_OWN}.key_secret"
     if not path.is_file():
         raise TransportError(f"{folder}: no keys here; make them with `semantic-mapper keys make --keys {folder}`")

@@ -548,8 +548,7 @@ class QuerySocket(Closing):
         self._socket = self._connect()
 
     def ask(self, parts: Sequence[Buffer]) -> list[bytes]:
-        """The parts of the answer. Raises TransportError: closed, nobody has answered, or the answer is beyond all
-        limits."""
+        """The parts of the answer. Raises TransportError: closed, no answer, or one beyond all limits."""
         with self._lock:
             for _ in range(self._attempts):
                 if self._closed:

@@ -105,8 +105,7 @@ def resized(box: Primitive, size: Float64) -> Primitive:
 
 def closed_mesh(vertices: Float64, faces: Int64) -> tuple[Float64, Int64]:
     """A mesh with each place once and all triangles facing outwards; polygons of 4 corners become triangles.
-    Raises ConfigError: a face with a vertex that is not there, edges that belong to one triangle alone or to more than
-    two, or no volume."""
+    Raises ConfigError: a face with a vertex that is not there, an edge of other than two triangles, or no volume."""
     if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
         raise ConfigError(f"faces must name vertices 0 to {len(vertices) - 1}")
     extent = float(np.ptp(vertices, axis=0).max())
