@@ -178,8 +178,9 @@ def match_candidates(goers: Sequence[Candidate], comers: Sequence[Candidate]) ->
     for row, a in enumerate(goers):
         # Of what is seen from another side the one or the other lies elsewhere.
         shift = np.linalg.norm(centers - a.centers, axis=2).min(axis=1)
-        near = (shift <= a.size.max()) & (looks.class_id == a.class_id)
-        possible = ((shift >= LEAST_SHIFT_M) | a.away) & (near | (np.minimum(a.free, free) >= GONE_FREE))
+        left, part = np.minimum(a.free, free), shift / a.size.max()  # moved by a part of its size, it left as much
+        near = (part <= 1) & (left >= part) & (looks.class_id == a.class_id)
+        possible = ((shift >= LEAST_SHIFT_M) | a.away) & (near | (left >= GONE_FREE))
         cost[row] = np.where(possible, pair_costs(Looked.of([a]), looks), np.inf)
     against = cost - DIFFERENT  # logarithm of the odds that they are two; no pair is better than one of more than 0
     found = zip(*scipy.optimize.linear_sum_assignment(np.minimum(against, 0)), strict=True)

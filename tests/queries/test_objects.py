@@ -182,6 +182,15 @@ def test_a_thing_seen_from_another_side_has_not_moved() -> None:
     assert [pair[:2] for pair in match_candidates([seen(0.0, 0.0)], [seen(0.15, 0.1)])] == [(0, 0)]
 
 
+def test_what_was_moved_by_half_its_size_left_half_of_its_place() -> None:
+    def seen(x: float, free: float) -> Candidate:
+        place = np.array((x, 0, 0)) * np.ones((2, 1))
+        return Candidate(5, np.full(3, 0.4), place, free, np.full(SIGNATURE, 9, np.int8), np.zeros(3, np.uint8))
+
+    assert match_candidates([seen(0, 0.55)], [seen(0.2, 0.55)])
+    assert not match_candidates([seen(0, 0.45)], [seen(0.2, 0.55)])  # one of a row, cut otherwise
+
+
 def test_of_two_that_left_the_more_alike_is_the_one_that_came() -> None:
     def seen(x: float, hue: int, high: int) -> Candidate:
         signature = np.zeros(SIGNATURE, np.int8)
