@@ -12,7 +12,7 @@ from semantic_mapper.errors import DependencyError, MapError, SemanticMapperErro
 from semantic_mapper.geometry import look_at
 from semantic_mapper.nodes import map_answers
 from semantic_mapper.plots import encode_picture
-from semantic_mapper.queries.find import EYE_M, FoundObject, find, picture_of, render, room_kinds
+from semantic_mapper.queries.find import EYE_M, LIKELY, FoundObject, find, picture_of, render, room_kinds
 from semantic_mapper.queries.objects import MapObject, ObjectChange
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64, UInt8
@@ -57,9 +57,11 @@ class MapTools:
         """Where a robot can stand to look at the likeliest thing that a phrase means: position on free floor and the
         level direction to face, in the world."""
         now = self._read()
-        answer = next((a for a in _answers(now, phrase) if a.T_world_camera is not None), None)
+        found = _answers(now, phrase)
+        likely = (a for a in found if a.probability >= LIKELY * found[0].probability)
+        answer = next((a for a in likely if a.T_world_camera is not None), None)
         if answer is None or (T := answer.T_world_camera) is None:
-            raise MapError(f"no place from which '{phrase}' is seen is known")
+            raise MapError(f"no place from which '{phrase}' is seen is known; `find` says where the likeliest thing is")
         level = T[:3, 2] - (T[:3, 2] @ now.up) * now.up
         position, forward = T[:3, 3] - EYE_M * now.up, level / np.linalg.norm(level)
         goal = {"position": np.round(position, 3).tolist(), "forward": np.round(forward, 3).tolist()}

@@ -96,8 +96,7 @@ def answer_changes(since_ns: int | None, changes: Sequence[ObjectChange]) -> dic
     there is no map of before."""
     if since_ns is None:
         raise MapError(
-            "changes: there is no map of before; `up --set map=FILE` goes on in one, and --since names that of a saved "
-            "map"
+            "changes: there is no map of before; `up --set mapper.map=FILE` goes on in one, --since names one"
         )
     return {
         "question": "changes",

@@ -43,8 +43,7 @@ class LiveCamera(Config, frozen=True):
     # the driver's: TOML file, or the same as a table
     config: str | dict[str, Any] = msgspec.field(default_factory=dict)
     id: Annotated[str, msgspec.Meta(pattern=SOURCE_PATTERN)] = "camera"  # what its frames are called
-    # Where it sits on the rig that `poses` tells of (T_base_rig, T_world_rig), row by row; empty = as its calibration
-    # file says.
+    # Where it sits on the rig that `poses` tells of (T_base_rig, T_world_rig), row by row; empty = by its calibration.
     T_rig_camera: tuple[PoseRow, PoseRow, PoseRow, PoseRow] | None = None
     # A camera that cannot be opened when the node starts is tried again for so long; 0 = until it is there. One that is
     # lost later is waited for without end.
@@ -128,8 +127,7 @@ class MapperOptions(Config, frozen=True):
     # tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
     publish: Annotated[str, msgspec.Meta(pattern=ENDPOINT_PATTERN)] = ""
 
-    # Folder of keys (`semantic-mapper keys`): questions and what is published are encrypted, and for its peers alone;
-    # empty = none.
+    # Folder of keys (`semantic-mapper keys`): questions and streams are encrypted, for peers alone; empty = none.
     keys: str = ""
 
     def inputs(self) -> tuple[str, ...]:

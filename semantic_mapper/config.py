@@ -192,8 +192,7 @@ class KeyframeConfig(Config, frozen=True):
     # those of the rendered view. A quarter of it where finetuned keyframes are among the source views.
     own_image_weight: Fraction = 0.8
     # Whether the map keeps features of views that its sensor measured (45 kB each, 300 at most), by which it is found
-    # again: `query MAP relocalize LOG`, `up --set map=...`, `merge`. Images can be guessed from such features; False
-    # keeps none.
+    # again: `query MAP relocalize LOG`, `up --set mapper.map=...`, `merge`. Images can be guessed from them.
     save_places: bool = True
 
 
@@ -204,8 +203,7 @@ class VoxelMapConfig(Config, frozen=True):
     depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
-    # Labels of less confidence read as unknown, 0 = none do. Confidence is calibrated: below 0.5 a label is more likely
-    # wrong than right
+    # Labels of less confidence read as unknown, 0 = none do. Below 0.5 a label is more likely wrong than right
     unknown_below: Fraction = 0.5
     clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``mapping/clearing.py``)
 
@@ -220,8 +218,7 @@ class VoxelMapConfig(Config, frozen=True):
 class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
 
-    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a twentieth where they fit the
-    # pictures ...
+    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a twentieth where they fit ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
 
@@ -229,8 +226,7 @@ class PoseRefinerConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach at least the last this many frames, at most twice as many; older ones stay in the map where they
-    # are. 0 = keep none.
+    # Corrections reach at least the last this many frames, at most twice as many; older ones stay. 0 = keep none.
     max_frames: NotNegative = 0
     # In the folder for temporary files; the oldest frames leave earlier for it.
     max_disk_mb: AtLeastOne = 4000

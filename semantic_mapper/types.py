@@ -142,11 +142,9 @@ class PosedFrame:
     T_world_camera: Float64  # (4, 4)
     pose_source: str = "log"  # where the pose comes from ("log", "odometry", ...)
     pose_sigma: float = 0.0  # one-sigma position uncertainty in metres; 0 = not known
-    # (H, W) one-sigma spread of ``depth_m`` in metres, where it was computed from pictures; None where a sensor
-    # measured it
+    # (H, W) one-sigma spread of ``depth_m`` in metres, where it was computed from pictures; None = measured
     depth_sigma_m: Float32 | None = None
-    # ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth: nothing is scored
-    # against it.
+    # ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth.
     label_is_pseudo: bool = False
     # of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is
     world: int = 0
@@ -208,8 +206,7 @@ class RayBatch:
     near_m: torch.Tensor  # (R,) float32 z bounds of the search
     far_m: torch.Tensor
     prior_depth_m: torch.Tensor  # (R,) float32 z from a sensor or a map, 0 = none
-    # (R,) bool, where the prior is measured at the very pixel rather than filled in from others; None = wherever there
-    # is a prior
+    # (R,) bool, where the prior is measured at the very pixel rather than filled in; None = wherever one is
     measured: torch.Tensor | None = None
     stamp_ns: int | None = None  # when they are, for fields with things that move; None = such things are not there
 
@@ -244,8 +241,7 @@ class MapUpdate:
     rays: int = 0  # rendered for this frame
     samples: int = 0  # of a ray, 0 where the field draws its own
     stage_ms: dict[str, float] = field(default_factory=dict[str, float])  # wall time of each stage
-    # (H, W), what was left out of the map because it moves; None where that is off, and over sockets also where nothing
-    # moves
+    # (H, W), what was left out of the map because it moves; None where that is off, or over sockets nothing moves
     moving: Bool | None = None
     world: int = 0  # in which the frame's pose came; see ``PosedFrame``
     # (4, 4), where the map has that world: its cameras are at ``T_map_world @ T_world_camera``

@@ -16,8 +16,7 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 class Config(semantic_mapper.config.Config, frozen=True):
     """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is requested."""
 
-    # Its id (MXID), its IP address (PoE), or its USB path, as ``doctor --cameras`` shows them. Empty = the only
-    # one that is connected.
+    # Its id (MXID), its IP address (PoE), or its USB path, as ``doctor --cameras`` shows. Empty = the only one.
     device: str = ""
     rgb: Socket = "CAM_A"  # the camera that gives the images; depth and intrinsics are its
     left: Socket = "CAM_B"  # of the stereo pair
@@ -28,12 +27,10 @@ class Config(semantic_mapper.config.Config, frozen=True):
     depth: bool = True  # False for boards without a stereo pair
     stereo_width: Width = 640  # of the images that depth and odometry are computed from
     stereo_height: Height = 400
-    # DepthAI's preset of the stereo matcher. This one would rather leave a pixel without depth than guess: a map has
-    # other views of it.
+    # DepthAI's preset of the stereo matcher. This one rather leaves a pixel without depth than guesses.
     stereo_preset: Preset = "fast_accuracy"
     ir_dots: Fraction = 0.0  # power of the dot projector ("Pro" boards): depth on bare walls; disturbs odometry
-    # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs the stereo pair and an IMU) as the images' own
-    # pose.
+    # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs stereo and an IMU) as the images' own pose.
     odometry: bool = False
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""

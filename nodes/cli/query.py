@@ -276,7 +276,7 @@ def _relocalize(output: Output, source: str, log: Path, every: int, *, live: boo
     """Find the frames of a log in a saved map."""
     if live:
         raise ConfigError(
-            f"{source}: is a running mapper, and frames are found in a saved map; `up --set map=FILE` goes on in one"
+            f"{source}: is a running mapper; frames are found in a saved map (`up --set mapper.map=FILE` goes on there)"
         )
     must_be_there(log)
     voxel_map = VoxelMap.load(map_path(Path(source)))
@@ -380,7 +380,7 @@ def _change_table(found: dict[str, Any]) -> Table:
         (c["kind"], c["id"], c["class"], f"{c['probability'] * 100:.0f} %", *place(c["before"]), *place(c["now"]))
         for c in found["changes"]
     ]
-    names = ("", "id", "class", "probability", "room before", "center before, m", "room", "center, m")
+    names = ("", "object", "class", "probability", "room before", "center before, m", "room", "center, m")
     return table(rows, names, title=found["map"], caption=_plain_names(found["changes"]) or "nothing else has changed")
 
 
@@ -396,7 +396,7 @@ def _find_table(found: dict[str, Any]) -> Table:
         )
         for a in found["answers"]
     ]
-    names = ("id", "class", "probability", "room", "center, m", "last seen", "look from, m")
+    names = ("object", "class", "probability", "room", "center, m", "last seen", "look from, m")
     notes = (found.get("note", ""), _plain_names(found["answers"])) if rows else ("nothing in the map fits all of it",)
     caption = "; ".join(filter(None, notes))
     return table(rows, names, title=f"{found['map']}: {found['phrase']}", caption=caption)

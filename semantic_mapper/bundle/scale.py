@@ -12,8 +12,7 @@ _FIRST_M = 0.6  # of way, for a first scale
 _WINDOW_M = 4.0  # of way that the scale is taken over
 _MAX_RATIO = 3.0  # a way that differs so much from the others means a slip or a jump
 
-# Of a floor, in parts of the camera's height over it: half the thickness of its layer, and how far below it points
-# contradict it.
+# Of a floor, in parts of the camera's height over it: half its thickness, and how far below it points contradict it.
 _LAYER, _MARGIN = 0.03, 0.1
 _STRAYS, _STRAY_FRACTION = 3, 0.008  # such points, of all: in nine films 0.1 to 0.6 %; below a table over 1.7 %
 _LEAST_POINTS, _LEAST_FRACTION = 20, 0.015  # on it; 3.0 to 17 %

@@ -30,8 +30,7 @@ class WorkingView:
     T_world_camera: Float64  # (4, 4)
     # (H, W) class channels that are known of the view, -1 = none; None for a view without labels
     channel: NDArray[np.integer] | None = None
-    # (H, W) one-sigma spread of ``depth_m`` where it was computed from pictures, 0 where it was measured; None where
-    # all of it was
+    # (H, W) one-sigma spread of ``depth_m`` where it was computed from pictures, 0 where measured; None = all was
     depth_sigma_m: Float32 | None = None
 
 

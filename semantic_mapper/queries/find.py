@@ -35,12 +35,13 @@ from semantic_mapper.types import Float64, UInt8
 LEAST_PROBABILITY = 0.005  # of an answer
 COLOR_LIGHTNESS, COLOR_SPREAD = 0.7, 12.0  # weight of lightness, which light changes; CIELAB distance of one sigma
 LIGHTEST = 95, 92.0  # percentile of the lightness of things that is taken for this one, as rooms are dark and bright
-SHADE_SPREAD = 8.0  # CIELAB lightness
+MIDDLE_LIGHT, SHADE_SPREAD = 55.0, 8.0  # CIELAB lightness
 SIZE_SPREAD = 0.12  # logarithm of a ratio of lengths
 LENGTHS, LIKELY = ("size", "height", "length"), 0.5  # of ``_sizes``; of the best probability, to be the largest of all
 NEAR_M, NEAR_SPREAD_M = 0.7, 0.15  # between surfaces
 ON_M, FOOTPRINT_M, ABOVE_M = 0.08, 0.06, 0.4
 TOUCH_M, TOUCH_SPREAD_M = 0.12, 0.03  # of a wall or floor
+ROOM_UNKNOWN = 0.2  # probability of any room, of what stands in none that is known
 ROOM_OF_NO_KIND = 1.0  # weight of evidence, against those of ``ROOM_KINDS``
 LOOK_M, EYE_M = (0.5, 2.5), 1.2  # from a thing; height of a camera over the floor
 RADIUS_M, BODY_M, FLOORS = 0.25, (0.15, 1.5, 0.1), {"floor", "floormat"}  # of a robot; heights that it takes, step
@@ -85,7 +86,7 @@ def find(
             parts[f"room {room}" if isinstance(room, int) else room] = scene.in_room(thing, room)
         if not (phrase.after_ns or 0) <= thing.last_seen_ns < (phrase.before_ns or 2**63):
             continue
-        parts["there"] = thing.present
+        parts["there"] = 1.0 if phrase.last else thing.present
         if (probability := float(np.prod(list(parts.values())))) >= LEAST_PROBABILITY:
             found.append((probability, n, parts))
     for relation, noun in phrase.relations:
@@ -139,9 +140,9 @@ class _Scene:
         if noun.colors:
             names = color_names(_lab(thing.color) * self._gain)
             parts["color"] = max(names[name] for name in noun.colors)
-            if noun.shade:
-                usual = np.mean([_colors()[name][:, 0].mean() for name in noun.colors])
-                parts["shade"] = _soft(noun.shade * (_lab(thing.color)[0] * self._gain - usual) / SHADE_SPREAD)
+        if noun.shade:
+            usual = np.mean([_colors()[name][:, 0].mean() for name in noun.colors] or [MIDDLE_LIGHT])
+            parts["shade"] = _soft(noun.shade * (_lab(thing.color)[0] * self._gain - usual) / SHADE_SPREAD)
         for what, sign in noun.sizes:
             if abs(sign) == 1:
                 median = self._medians.get(thing.class_id, _sizes(thing))
@@ -165,9 +166,9 @@ class _Scene:
         return best or None
 
     def in_room(self, thing: MapObject, room: int | str) -> float:
-        if isinstance(room, int):
-            return float(thing.room == room)
-        return self._kinds.get(thing.room or 0, {}).get(room, 0.0)
+        if thing.room is None:
+            return ROOM_UNKNOWN
+        return float(thing.room == room) if isinstance(room, int) else self._kinds[thing.room].get(room, 0.0)
 
     def related(self, things: Sequence[MapObject], relation: str, noun: NounPhrase) -> list[float]:
         """How well things stand in a relation to any other that fits a noun."""

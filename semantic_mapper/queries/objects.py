@@ -21,6 +21,7 @@ from semantic_mapper.mapping.map_types import require_metres
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import OrientedBox, upright_box
+from semantic_mapper.queries.phrase import has_date
 from semantic_mapper.queries.revisit import (
     FIXTURES,
     GONE_FREE,
@@ -359,6 +360,8 @@ class ObjectMemory:
             content = zstd_decompress(data[4:], size, "object memory")
             rows = msgspec.msgpack.decode(content, type=_Rows, dec_hook=_unpack)
             whole = all(o.id > 0 and o.classes and o.places and o.signature.shape == (SIGNATURE,) for o in rows.objects)
+            boxes = [box for o in rows.objects for box in (o.box, *(place.box for place in o.places))]
+            whole &= all(np.isfinite((*box.center, *box.size, *box.R_world_box.ravel())).all() for box in boxes)
         except (CodecError, struct.error, msgspec.DecodeError, ValueError, TypeError) as error:
             raise MapError(f"object memory is damaged: {error}") from error
         if not whole:
@@ -497,13 +500,17 @@ def changes_between(
         return changes_of(ours.objects, before.last_stamp_ns), before
     later_ns, T = 0, np.eye(4)
     if now.last_stamp_ns <= before.last_stamp_ns:
+        if has_date(now.last_stamp_ns):
+            raise MapError(
+                "changes: the map of before is the later one by its dates; give the maps the other way round"
+            )
         first_ns = min((p.stamp_ns for p in now.places.places), default=now.last_stamp_ns)
         later_ns = first_ns - 1 - before.last_stamp_ns
     if not shared_places(now.places.places, before.places.places):
         try:
             T = find_alignment(now, before).T_map_other
         except AlignmentError as error:
-            raise MapError(f"changes: {error}; map later logs in the map of before: --set map=FILE") from error
+            raise MapError(f"changes: {error}; go on in the map of before: `up --set mapper.map=FILE`") from error
         aligned = VoxelMap(now.config, now.label_set)
         aligned.add(before, T)
         before = aligned

@@ -44,6 +44,7 @@ _CLOCK = r"(?P<clock>noon|midnight|\d{1,2}(?::\d\d)?(?: ?[ap]m)?)"
 _DAY = r"(?:(?P<when>before|until|after|since|on) )?(?P<day>today|yesterday|\d{4}-\d\d-\d\d)"
 _DATED = re.compile(rf"\b{_DAY}(?: at)?(?: {_CLOCK})?(?= |$)")
 _TODAY = re.compile(rf"\b(?P<when>before|until|after|since) {_CLOCK}(?= |$)")
+_LAST_SEEN = re.compile(r"\blast\s+(saw|see|seen)\b", re.IGNORECASE)
 _LAST = re.compile(r"\b(?:in|within) the (?:last|past) (?P<n>\d+ )?(?P<unit>minute|hour|day|week)s?\b")
 _UNITS_NS = {"minute": 60 * 10**9, "hour": 3600 * 10**9, "day": 86_400 * 10**9, "week": 604_800 * 10**9}
 
@@ -67,6 +68,7 @@ class Phrase:
     thing: NounPhrase
     relations: tuple[tuple[str, NounPhrase], ...] = ()  # of ``RELATIONS``
     rooms: tuple[int | str, ...] = ()  # ids, or kinds of ``ROOM_KINDS``
+    last: bool = False  # where it was last seen is asked, be it there still or not
     # after_ns, before_ns: Last seen then; None = any time.
     after_ns: int | None = None
     before_ns: int | None = None
@@ -89,14 +91,17 @@ def read_phrase(text: str, labels: LabelSet, now_ns: int, encoder: TextEncoder |
         what = [w for w in noun.split() if w not in _FILLER]
         room = re.fullmatch(r"room (\d{1,9})", " ".join(what))
         kind = _KINDS.get("".join(what)) if word == "in" else None
+        if what == ["room"]:  # any
+            continue
         if room or kind:
             rooms.append(int(room[1]) if room else kind or "")
         elif what:
             relations.append((_RELATIONS[word], _read_noun(what, labels, nouns, encoder)))
         elif word != "at":  # "where is the cup at"
             raise MapError(f"find: '{word}' needs a thing{' or a room' * (word == 'in')} behind it")
-    thing = _read_noun([w for w in first.split() if w not in _FILLER], labels, nouns, encoder)
-    return Phrase(thing, tuple(relations), tuple(rooms), after_ns, before_ns)
+    words = [w for w in first.split() if w not in _FILLER] or ["thing"] * bool(relations or rooms)
+    thing = _read_noun(words, labels, nouns, encoder)
+    return Phrase(thing, tuple(relations), tuple(rooms), bool(_LAST_SEEN.search(text)), after_ns, before_ns)
 
 
 def _nouns(labels: LabelSet) -> dict[str, dict[int, float]]:
@@ -120,7 +125,7 @@ def _read_noun(
         joined = [("".join(words[:n]), n) for n in (3, 2, 1) if n <= len(words)]
         word, n = next((j for j in joined if _folded(j[0]) in nouns), joined[-1]) if encoder is None else joined[-1]
         words = words[n:]
-        if word in _SHADES and words and words[0] in _COLORS:  # "light" alone is a thing
+        if word in _SHADES and words:  # "light" alone is a thing
             shade = _SHADES[word]
         elif word in _COLORS:
             colors.append(_COLORS[word])
@@ -130,6 +135,7 @@ def _read_noun(
             known = [*nouns, *_COLORS, *_SIZES, *_KINDS, *_RELATIONS]
             near = difflib.get_close_matches(_folded(word), dict.fromkeys(known), n=3, cutoff=0.6)
             hint = f"did you mean {' or '.join(near)}?" if near else f"things are {', '.join(labels.names)}"
+            hint = f"of a room say 'in the {word}'" if word in _KINDS else hint
             raise MapError(f"find: '{word}' is not known; {hint}")
         else:
             found.append(word)

@@ -150,8 +150,10 @@ class RememberedObjects:
 
     @classmethod
     def of_saved(cls, objects: tuple[MapObject, ...]) -> "RememberedObjects":
-        """Of a saved map, since its first visit."""
-        return cls(objects, min((o.places[0].stamp_ns for o in objects), default=0))
+        """Of a saved map, since its first visit, where there was another."""
+        first = min((o.places[0].stamp_ns for o in objects), default=0)
+        last = max((max(o.places[-1].stamp_ns, o.last_seen_ns, o.gone_ns or 0) for o in objects), default=0)
+        return cls(objects, first if last > first else 0)
 
     @property
     def changes(self) -> tuple[ObjectChange, ...]:

@@ -58,8 +58,7 @@ class Suggestion:
     """A frame to label."""
 
     index: int  # of the candidate
-    # Fraction of the log's pixels that it adds to what labelled and earlier suggested frames show; None where the
-    # frames have no depth
+    # Fraction of the log's pixels that it adds to what labelled and earlier suggested frames show; None without depth
     gain: float | None
     shown: float | None  # fraction that all of them show then; None likewise
 

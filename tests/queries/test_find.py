@@ -117,6 +117,7 @@ def test_times_are_local_and_of_the_day_of_the_map(text: str, after: int | None,
     ("text", "said"),
     [
         ("red chiar", "'chiar' is not known; did you mean chair"),
+        ("the kitchen", "of a room say 'in the kitchen'"),
         ("toilett", "did you mean toilet or violet\\?"),
         ("a xylophonist", "things are floor, wall"),
         ("chair left of the sofa", "'left of' cannot be answered; relations are near, on"),
@@ -128,7 +129,6 @@ def test_times_are_local_and_of_the_day_of_the_map(text: str, after: int | None,
         ("chair in the", "'in' needs a thing or a room behind it"),
         ("chair seen after 25:00", "is no time"),
         ("chair seen on 9999-12-31", "is no time"),
-        ("the dark chair", "'dark' is not known"),
         ("chair in the garage", "'garage' is not known"),
     ],
 )
@@ -207,6 +207,10 @@ KITCHEN = [
         ("object on the table", 6, {6}),
         ("object under the table", 7, {7}),
         ("red chair on the floor", 1, {1, 3}),
+        ("dark chair", 1, {1, 3, 2}),
+        ("what is on the table?", 6, {6}),
+        ("chair in the room", 1, {1, 2, 3}),
+        ("where did I last see an other object under the table", 7, {7}),
         ("other object on the wall", 9, {9}),
         ("chair last seen before noon", 3, {3}),
         ("white thing in room 2", 8, {8, 5, 9}),
@@ -229,6 +233,18 @@ def test_probabilities_are_products_of_parts_and_of_what_is_still_there() -> Non
     kinds = room_kinds(KITCHEN)
     assert kinds[1]["kitchen"] > 0.5 and kinds[2]["bathroom"] > 0.8
     assert all(sum(kind.values()) == pytest.approx(1) for kind in kinds.values())
+
+
+def test_a_thing_in_no_known_room_may_be_in_any() -> None:
+    nowhere = [replace(KITCHEN[0], id=12, room=None)]
+    assert find("chair in room 1", HOUSE, nowhere, up=UP)[0].parts["room 1"] == pytest.approx(0.2)
+    assert ids("chair in the kitchen", [*nowhere, *KITCHEN])[:3] == [1, 2, 12]
+
+
+def test_what_has_gone_for_sure_is_found_where_it_was_last_seen() -> None:
+    gone = [replace(KITCHEN[4], gone_ns=at(12), certainty=1.0)]
+    assert ids("table", gone) == [] and ids("where did you last see the table", gone) == [5]
+    assert ids("table last seen before midnight", gone) == [5]
 
 
 def test_what_has_no_class_of_its_own_is_said_to_have_none() -> None:

@@ -329,6 +329,21 @@ def test_a_memory_is_the_same_after_it_was_saved() -> None:
     assert ObjectMemory.from_bytes(b"").objects == ()
 
 
+def test_a_memory_of_what_is_nowhere_is_refused() -> None:
+    memory = full_memory()
+    thing = memory.objects[0]
+    nowhere = replace(thing, id=99, box=replace(thing.box, center=np.full(3, np.nan)))
+    with pytest.raises(MapError, match="damaged"):
+        ObjectMemory.from_bytes(ObjectMemory([thing, nowhere]).to_bytes())
+
+
+def test_maps_in_the_wrong_order_of_their_dates_are_refused() -> None:
+    today, yesterday = (VoxelMap.received(house_changes(two_rooms(), 0), VOXEL_M, LABELS) for _ in range(2))
+    today.last_stamp_ns, yesterday.last_stamp_ns = 1_700_000_000 * 10**9, 1_700_086_400 * 10**9
+    with pytest.raises(MapError, match="the other way round"):
+        changes_between(today, yesterday)
+
+
 @pytest.mark.parametrize("damage", [lambda d: d[:-3], lambda d: d[:10], lambda d: b"\xff\xff\xff\xff" + d[4:]])
 def test_a_damaged_memory_is_refused(damage) -> None:
     with pytest.raises(MapError, match="object memory"):

@@ -17,13 +17,13 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.objects import remember
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import COMMAND, refused
-from tests.queries.house import LABELS, VOXEL_M, Box, house_changes, two_rooms
+from tests.queries.house import AIR, LABELS, VOXEL_M, Box, house_changes, two_rooms
 
 Calls = list[tuple[str, dict[str, Any]]]
 
 
-def house(stamp_ns: int, chest: Box | None = None) -> VoxelMap:
-    boxes = [*two_rooms(), *([] if chest is None else [chest])]
+def house(stamp_ns: int, *more: Box) -> VoxelMap:
+    boxes = [*two_rooms(), *more]
     made = VoxelMap.received(house_changes(boxes, 0), VOXEL_M, LABELS)
     made.last_stamp_ns = stamp_ns
     view = Place("front", 1, np.eye(4), np.ones((1, 3), np.float32), np.zeros((1, DESCRIPTOR_BYTES), np.uint8))
@@ -98,6 +98,18 @@ def test_an_agent_asks_a_running_mapper() -> None:
         _, (found, none, changes) = call(calls, service.endpoint)
     assert [a["class"] for a in found["answers"]] == ["table"]
     assert "limit is 0" in none.text and "no map of before" in changes.text
+
+
+def test_a_map_of_one_visit_has_no_changes_and_no_goal_beside_another_thing(tmp_path: Path) -> None:
+    largest: Box = ("table", (20.0, 0.0, 0.0), (22.0, 2.0, 0.9))  # and no floor round it
+    made = house(10, largest, (AIR, (19.0, -1.0, -0.5), (23.0, 3.0, 2.0)))
+    remember(made)
+    made.save(tmp_path / "map.npz")
+    _, (changes, goal, other) = call(
+        [("what_changed", {}), ("goal_near", {"phrase": "largest table"}), ("goal_near", {"phrase": "smallest table"})],
+        tmp_path / "map.npz",
+    )
+    assert "no map of before" in changes.text and "no place from which" in goal.text and other["position"][0] < 7
 
 
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
