@@ -381,7 +381,8 @@ def _change_table(found: dict[str, Any]) -> Table:
         for c in found["changes"]
     ]
     names = ("", "object", "class", "probability", "room before", "center before, m", "room", "center, m")
-    return table(rows, names, title=found["map"], caption=_plain_names(found["changes"]) or "nothing else has changed")
+    caption = _plain_names(found["changes"]) if rows else "nothing has changed of what both maps have seen"
+    return table(rows, names, title=found["map"], caption=caption)
 
 
 def _find_table(found: dict[str, Any]) -> Table:
