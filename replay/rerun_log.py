@@ -279,7 +279,7 @@ def is_large(thing: Instance) -> bool:
 
 
 def free_place(room: Room, names: Float64) -> Float64:
-    """Where on its floor a room's own name is farthest from other ``names`` (N, 3): (3,) in the middle, or half out."""
+    """Where on its floor a room's own name is farthest from other ``names`` (N, 3): (3,) in the middle, or half way."""
     places = np.concatenate((room.center[None], (room.center + room.outline) / 2))
     return places[cdist(places, names).min(axis=1, initial=np.inf).argmax()]
 

@@ -218,7 +218,7 @@ class VoxelMapConfig(Config, frozen=True):
 class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
 
-    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a twentieth where they fit ...
+    # One sigma of given poses where frames tell none (``pose_sigma`` 0), to a twentieth where they fit pictures ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
 
@@ -226,7 +226,7 @@ class PoseRefinerConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach at least the last this many frames, at most twice as many; older ones stay. 0 = keep none.
+    # Corrections reach at least the last this many frames, at most twice as many; older ones stay put. 0 = none.
     max_frames: NotNegative = 0
     # In the folder for temporary files; the oldest frames leave earlier for it.
     max_disk_mb: AtLeastOne = 4000

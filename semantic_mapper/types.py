@@ -144,7 +144,7 @@ class PosedFrame:
     pose_sigma: float = 0.0  # one-sigma position uncertainty in metres; 0 = not known
     # (H, W) one-sigma spread of ``depth_m`` in metres, where it was computed from pictures; None = measured
     depth_sigma_m: Float32 | None = None
-    # ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth.
+    # ``label`` was rendered by a field (``autolabel``). It may be learned from, never scored against.
     label_is_pseudo: bool = False
     # of a camera whose world begins where it starts: which one the pose is in. 0 = the one that there is
     world: int = 0

@@ -20,7 +20,7 @@ class Config(config.Config, frozen=True):
     width: NotNegative = 0  # uncalibrated: of the requested images; 0 = as the device has it
     height: NotNegative = 0
     fps: Annotated[float, msgspec.Meta(ge=0.01, le=1000)] = 30.0  # requested; what the device gives instead is reported
-    # Pixel requested format, four letters. MJPG passes USB at full rate; YUYV has no artefacts. Empty = as it is.
+    # Pixel requested format, four letters. MJPG passes USB at full rate; YUYV has no artefacts. Empty = as set.
     fourcc: Annotated[str, msgspec.Meta(pattern=r"^(.{4}|)\Z")] = "MJPG"
     # 0 = automatic; a short one blurs less while the robot moves
     exposure_ms: Annotated[float, msgspec.Meta(ge=0, le=_MAX_EXPOSURE_MS)] = 0.0

@@ -40,7 +40,7 @@ class ImportOptions:
     # turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side
     quarters: int = 0
     megapixels: float = MEGAPIXELS  # larger pictures are made smaller, to about this; 0 = none is
-    # ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), if several fit. Depth "none": without.
+    # ROS bags: topics by role ("image", "depth", "info", "depth_info", "pose"), if several fit. Any: depth "none".
     topics: Mapping[str, str] = field(default_factory=dict[str, str])
     renames: Mapping[str, str] = field(default_factory=dict[str, str])  # new names of classes, by their present ones
     world: str = ""  # ROS bags: frame of tf in which poses are; empty = map, world or odom

@@ -171,8 +171,9 @@ class GraphTracker:
 
     def room_of(self, points: Float64) -> int | None:
         """Room of the last update that holds most of points (N, 3), world metres, of a thing; None = none does."""
-        up = np.array((0.0, 0.0, 1.0)) if self._up is None else self._up
-        return _room_of(points, turn_onto(up, np.array((0.0, 0.0, 1.0))), self._plans, self._cell_m)
+        with self._lock:
+            up = np.array((0.0, 0.0, 1.0)) if self._up is None else self._up
+            return _room_of(points, turn_onto(up, np.array((0.0, 0.0, 1.0))), self._plans, self._cell_m)
 
     def _identify(
         self, found: RoomPlan, height: float, first: Int64, taken: Sequence[_Plan]

@@ -361,7 +361,8 @@ class ObjectMemory:
             rows = msgspec.msgpack.decode(content, type=_Rows, dec_hook=_unpack)
             whole = all(o.id > 0 and o.classes and o.places and o.signature.shape == (SIGNATURE,) for o in rows.objects)
             boxes = [box for o in rows.objects for box in (o.box, *(place.box for place in o.places))]
-            whole &= all(np.isfinite((*box.center, *box.size, *box.R_world_box.ravel())).all() for box in boxes)
+            parts = [part.ravel() for box in boxes for part in (box.center, box.size, box.R_world_box)]
+            whole &= bool(np.isfinite(np.concatenate((*parts, np.zeros(1)))).all())
         except (CodecError, struct.error, msgspec.DecodeError, ValueError, TypeError) as error:
             raise MapError(f"object memory is damaged: {error}") from error
         if not whole:

@@ -1,7 +1,7 @@
 """Rooms of one floor: its plan, parted where it is as narrow as a door.
 
 Every cell of the plan climbs to the place near by that is farthest from the walls; cells that end at one place are its
-basin. Two basins are one room where the passage between them is wider than a door, or nearly as wide as one."""
+basin. Two basins are one room where the passage between them is wider than a door, or nearly as wide as the smaller."""
 
 from typing import Any, NamedTuple
 

@@ -200,7 +200,7 @@ KITCHEN = [
         ("tall chair", 3, {3, 1, 2}),
         ("the largest chair", 3, {3, 1, 2}),
         ("smallest chair in the bathroom", 3, {3, 1, 2}),
-        ("the smallest thing", 6, {6, 7}),  # and none that is none of the smallest
+        ("the smallest thing", 6, {6, 7}),  # what is far larger is not listed
         ("object on the smallest table", 6, {6}),
         ("chair near the table", 3, {3}),
         ("chair near the fridge", 2, {2}),
