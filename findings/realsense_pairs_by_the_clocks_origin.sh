@@ -13,10 +13,14 @@ set -eu
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 cat > "$work/try.py" <<'PY'
+import ctypes
 import sys
 import time
 
+import libusb_package
 import numpy as np
+
+ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)  # which RealSense's wheel lacks
 import pyrealsense2 as rs
 
 WIDTH, HEIGHT, RATE, FRAMES = 64, 48, 30, 20
@@ -96,5 +100,5 @@ sys.exit(
 )
 PY
 python3 -m venv "$work/env"
-"$work/env/bin/pip" install -q pyrealsense2==2.59.1.11053 numpy==2.4.6
+"$work/env/bin/pip" install -q pyrealsense2==2.59.1.11053 numpy==2.4.6 libusb-package==1.0.30.0
 "$work/env/bin/python" "$work/try.py"

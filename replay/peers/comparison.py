@@ -55,7 +55,7 @@ PEERS = {
     "octomap": PeerKind("mapper", "OctoMap", "octomap"),
     "ours-odometry": PeerKind("odometry", "ours", f"{_HERE}.odometry:ours"),
     "small-gicp": PeerKind("odometry", "small_gicp", "small_gicp"),
-    "kiss-icp": PeerKind("odometry", "KISS-ICP", "kiss_icp"),
+    "kiss-icp": PeerKind("odometry", "KISS-ICP", "kiss_icp", f"{_EXTRA}, with Python below 3.14"),
     "open3d-odometry": PeerKind("odometry", "Open3D RGB-D", f"{_HERE}.odometry:open3d"),
 }
 
