@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Run a command in a clone of this checkout on a bare Debian: Python 3 with pip and venv, git, make and nothing else.
 #   tools/bare_machine.sh [--suite SUITE] [--user] [--name FOLDER] "COMMAND"
-# --suite: bookworm (Python 3.11, the default) or trixie (3.13). --user: an ordinary user with a read-only home, not root.
+# --suite: bookworm (Python 3.11, the default), trixie (3.13) or forky (3.14). --user: no root, and a read-only home.
 # --name: name of the clone's folder, such as "a föld er". BARE_ROOT names the folder of the system (made if missing).
 # Needs root, and debootstrap, which is installed where apt can; without them it says so loudly and exits with 0.
 set -euo pipefail
@@ -37,7 +37,7 @@ if [[ ! -x $root/usr/bin/git || ! -x $root/usr/bin/make ]]; then
   rm -rf --one-file-system "$root"
   packages=python3,python3-pip,python3-venv,git,make,ca-certificates
   log="$(mktemp)"
-  if ! debootstrap --variant=minbase "--include=$packages" "$suite" "$root" >"$log" 2>&1; then
+  if ! debootstrap --variant=minbase "--include=$packages" "$suite" "$root" "" sid >"$log" 2>&1; then
     tail -n 5 "$log" >&2
     skip "debootstrap failed for $suite"
   fi
