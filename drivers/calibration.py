@@ -30,7 +30,7 @@ from semantic_mapper.config import (
     read_json,
     read_toml,
 )
-from semantic_mapper.drivers.lens import ideal_fisheye_view, lens_intrinsics
+from semantic_mapper.drivers.lens import clear_view, ideal_fisheye_view, lens_intrinsics
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose, invert_pose
@@ -190,9 +190,7 @@ class Rectifier:
             if isinstance(measured, FisheyeIntrinsics):
                 undistort_maps, self.intrinsics = cv2.fisheye.initUndistortRectifyMap, ideal_fisheye_view(measured)
             else:
-                new = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)[0]
-                fx, fy, cx, cy = (float(v) for v in (new[0, 0], new[1, 1], new[0, 2], new[1, 2]))
-                self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
+                self.intrinsics = clear_view([(measured, np.eye(3))], *size)
         except FrameError as error:
             raise ConfigError(
                 f"the lens distortion {lens.tolist()} leaves no usable image: {error}; calibrate the camera again"

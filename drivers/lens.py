@@ -23,7 +23,10 @@ _ZERO_IS_PINHOLE = ("brown_conrady", "inverse_brown_conrady", "modified_brown_co
 
 MAX_HALF_VIEW = np.radians(65.0)  # to each side of what a fisheye's image is cut to: a pinhole stretches what is beyond
 MAX_INVERSE_PX = 1e-6  # by which the ray of a pixel may miss it
-_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-12)
+_STEPS, _ROUNDS, _EXACT_PX = 16, 60, 1e-9  # on the way to a pixel; rounds at most at each step, and when one ends
+_FAR = 2.0  # slope beyond which nothing is shown
+_PARTS = 0.95 ** np.arange(40)  # of a view that are tried
+_EDGE = 1e-4  # of an image's width and height, by which points of its border may miss it
 _THETAS = np.linspace(0.0, np.pi, 4096)
 
 
@@ -68,26 +71,89 @@ def _plain(model: str) -> str:
 def undistort(pixels: Float64, lens: CameraIntrinsics) -> Float64:
     """(N, 2) pixels of an image with distortion -> slopes (N, 2) of their rays, x / z and y / z in the camera's axes.
 
-    Raises FrameError: a pixel that the lens model gives to no ray (to within ``MAX_INVERSE_PX``).
+    Exact to ``MAX_INVERSE_PX``; NaN for a pixel that the lens model gives to no ray, as beyond its fold.
     """
+    # OpenCV's own inverse ends too early, or not at all, and a fisheye's stops at 90 degrees of the bent angle. This is
+    # Newton's method in steps away from the middle, so that a ray from beyond a fold is never taken.
+    slopes, centre = np.zeros((len(pixels), 2)), camera_matrix(lens)[:2, 2]
     if not len(pixels):
-        return np.zeros((0, 2))
-    K, coefficients, still = camera_matrix(lens), np.array(lens.distortion or (0.0,) * 4), np.zeros(3)
-    # By default OpenCV ends after five rounds: pixels off at the corner of a usual lens.
-    invert, project = getattr(cv2, "undistortPointsIter", cv2.undistortPoints), cv2.projectPoints  # of OpenCV 4
-    if isinstance(lens, FisheyeIntrinsics):
-        invert, project = cv2.fisheye.undistortPoints, cv2.fisheye.projectPoints
-    slopes = np.asarray(invert(pixels[:, None], K, coefficients, R=None, P=None, criteria=_UNTIL), np.float64)
-    rays = np.concatenate((slopes, np.ones((len(slopes), 1, 1))), axis=2)
-    back, _ = project(rays, still, still, K, coefficients)
-    off = np.linalg.norm(np.asarray(back).reshape(-1, 2) - pixels, axis=1)
-    if not off.max() <= MAX_INVERSE_PX:  # NaN, too
-        u, v = pixels[int(np.argmax(off))]
-        raise FrameError(
-            f"the lens distortion {list(lens.distortion)} gives pixel {u:.0f}, {v:.0f} of {lens.width}x{lens.height} "
-            "to no ray; calibrate again, with a board in all corners of the image"
-        )
-    return slopes.reshape(-1, 2)
+        return slopes
+    for part in np.arange(1, _STEPS + 1) / _STEPS:
+        for _ in range(_ROUNDS):
+            seen, slant = _bend(slopes, lens)
+            off = centre + part * (pixels - centre) - seen
+            rising = _area(slant) > 0
+            slopes[~rising] = np.nan
+            if not (np.abs(off[rising]) > _EXACT_PX).any():
+                break
+            slopes[rising] += np.linalg.solve(slant[rising], off[rising, :, None])[..., 0]
+    seen, _ = _bend(slopes, lens)
+    on_the_way = _bend((np.linspace(0, 1, 16)[:, None, None] * slopes).reshape(-1, 2), lens)[1].reshape(
+        -1, len(pixels), 2, 2
+    )
+    good = (np.linalg.norm(seen - pixels, axis=1) <= MAX_INVERSE_PX) & (_area(on_the_way) > 0).all(axis=0)
+    slopes[~good] = np.nan
+    return slopes
+
+
+def _bend(slopes: Float64, lens: CameraIntrinsics) -> tuple[Float64, Float64]:
+    """Pixels (N, 2) of rays with slopes (N, 2), and by how much they move with these (N, 2, 2); NaN of NaN."""
+    still, rays = np.zeros(3), _ahead(slopes)[:, None]
+    project, shifts = (cv2.fisheye.projectPoints, 11) if isinstance(lens, FisheyeIntrinsics) else (cv2.projectPoints, 3)
+    coefficients = np.array(lens.distortion or (0.0,) * 4, np.float64)
+    pixels, slants = project(rays, still, still, camera_matrix(lens), coefficients)[:2]
+    return np.reshape(pixels, (-1, 2)), np.reshape(slants, (len(slopes), 2, -1))[..., shifts : shifts + 2]
+
+
+def _area(slant: Float64) -> Float64:
+    """Determinants of (..., 2, 2)."""
+    return slant[..., 0, 0] * slant[..., 1, 1] - slant[..., 0, 1] * slant[..., 1, 0]
+
+
+def clear_view(lenses: Sequence[tuple[CameraIntrinsics, Float64]], width: int, height: int) -> CameraIntrinsics:
+    """The widest pinhole camera, of a size in pixels, whose rays all lie in the images of all lenses.
+
+    ``lenses`` have turns R_view_lens (3, 3) of their axes. Raises FrameError: they have next to nothing in common.
+    """
+    boxes: list[Float64] = []  # slopes to the left, up, right, down
+    for lens, R in lenses:
+        rays = _ahead(undistort(_border(0, 0, lens.width - 1, lens.height - 1), lens)) @ R.T
+        left, up, right, down = np.split(rays[:, :2] / rays[:, 2:], 4)  # NaN where the lens folds before its edge
+        least, most = np.fmax.reduce((left[:, 0], up[:, 1]), axis=1), np.fmin.reduce((right[:, 0], down[:, 1]), axis=1)
+        boxes.append(np.nan_to_num(np.concatenate((np.fmax(least, -_FAR), np.fmin(most, _FAR)))))
+    least, most = np.max(boxes, axis=0)[:2], np.min(boxes, axis=0)[2:]
+    for part in _PARTS:  # the first, but for lenses that fold
+        middle, half = (least + most) / 2, part * (most - least) / 2
+        rays = _ahead(_border(*(middle - half), *(middle + half)))
+        if (half > 0).all() and all(_shows(lens, rays @ R) for lens, R in lenses):
+            focal = (np.array((width, height)) - 1) / (2 * half)
+            return CameraIntrinsics(*focal.tolist(), *(focal * (half - middle)).tolist(), width, height)
+    raise FrameError("no ray lies in the whole of it")
+
+
+def _border(left: float, up: float, right: float, down: float) -> Float64:
+    """Points (4 N, 2) on the edges of a box: left, upper, right, lower."""
+    x, y = np.linspace((left, up), (right, down), 129).T
+    edges = (
+        (np.full_like(x, left), y),
+        (x, np.full_like(x, up)),
+        (np.full_like(x, right), y),
+        (x, np.full_like(x, down)),
+    )
+    return np.concatenate([np.stack(edge, axis=1) for edge in edges])
+
+
+def _ahead(slopes: Float64) -> Float64:
+    """Rays (N, 3) of slopes (N, 2)."""
+    return np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0)
+
+
+def _shows(lens: CameraIntrinsics, rays: Float64) -> bool:
+    """Whether all rays (N, 3) lie in the image, and before the fold of the lens."""
+    slopes = rays[:, :2] / rays[:, 2:]
+    pixels, _ = _bend(slopes, lens)
+    inside = (np.abs(pixels / (np.array((lens.width, lens.height)) - 1) - 0.5) < 0.5 + _EDGE).all()
+    return bool(inside and np.abs(undistort(pixels, lens) - slopes).max() < MAX_INVERSE_PX)
 
 
 def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:

@@ -82,9 +82,15 @@ def compare_camera(
 
 
 def ideal_pixels(pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
-    """(N, 2) -> where a camera without distortion, otherwise the same, would see them."""
-    K = camera_matrix(intrinsics)
-    return undistort(pixels, intrinsics) * K.diagonal()[:2] + K[:2, 2]
+    """(N, 2) -> where a camera without distortion, otherwise the same, would see them. FrameError: one has no ray."""
+    K, slopes = camera_matrix(intrinsics), undistort(pixels, intrinsics)
+    if (lost := ~np.isfinite(slopes[:, 0])).any():
+        u, v = pixels[lost][0]
+        raise FrameError(
+            f"the lens distortion {list(intrinsics.distortion)} gives pixel {u:.0f}, {v:.0f} to no ray; calibrate "
+            "again, with a board in all corners of the image"
+        )
+    return slopes * K.diagonal()[:2] + K[:2, 2]
 
 
 def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: CalibrationConfig) -> CameraCalibration:

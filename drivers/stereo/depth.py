@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from semantic_mapper.drivers.calibration import StereoCalibration
+from semantic_mapper.drivers.lens import clear_view
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
+from semantic_mapper.types import Float32, UInt8
 
 BLOCK = 5  # pixels a side that are compared
 STEP = 16  # disparities are searched in multiples of it
@@ -42,30 +43,25 @@ class StereoDepth:
                 "x must be negative); calibrate again"
             )
         lenses = [(camera_matrix(k), np.array(k.distortion or (0.0,) * 5)) for k in (left, right)]
-        R_left, R_right, P_left, P_right, _, _, _ = cv2.stereoRectify(
+        R_left, R_right = cv2.stereoRectify(
             *lenses[0],
             *lenses[1],
             (left.width, left.height),
             pair.T_right_left[:3, :3],
             offset.reshape(3, 1),
-            flags=cv2.CALIB_ZERO_DISPARITY,
-            alpha=0,
-            newImageSize=size,
-        )
+        )[:2]
+        turned = [(left, np.asarray(R_left)), (right, np.asarray(R_right))]
+        try:  # OpenCV's own view may reach beyond the images
+            self.intrinsics = clear_view(turned, *size)
+        except FrameError as error:
+            raise ConfigError(f"the two cameras have no image in common: {error}; calibrate again") from error
         self._maps = [
-            cv2.initUndistortRectifyMap(K, lens, R, P, size, cv2.CV_16SC2)
-            for (K, lens), R, P in zip(lenses, (R_left, R_right), (P_left, P_right), strict=True)
+            cv2.initUndistortRectifyMap(K, lens, R, camera_matrix(self.intrinsics), size, cv2.CV_16SC2)
+            for (K, lens), (_, R) in zip(lenses, turned, strict=True)
         ]
         self.T_left_rectified = np.eye(4)  # from the rectified left camera to the left one
         self.T_left_rectified[:3, :3] = np.asarray(R_left).T
-        focal = float(P_left[0, 0])
-        try:
-            self.intrinsics = CameraIntrinsics(
-                focal, float(P_left[1, 1]), float(P_left[0, 2]), float(P_left[1, 2]), *size
-            )
-        except FrameError as error:
-            raise ConfigError(f"the two cameras have no image in common: {error}; calibrate again") from error
-        self._focal_baseline = focal * self.baseline_m
+        self._focal_baseline = self.intrinsics.fx * self.baseline_m
         self._depths = (min_depth_m, max_depth_m)
         needed = self._focal_baseline / min_depth_m
         self.disparities = STEP * max(1, int(np.ceil(needed / STEP)))

@@ -4,6 +4,8 @@ A client that does not keep up loses the oldest of what waits for it. What nobod
 On import, raises DependencyError: the extra is not installed.
 """
 
+import logging
+import re
 import threading
 import time
 from collections import Counter
@@ -37,6 +39,8 @@ except ModuleNotFoundError as error:
 
 HOST = "127.0.0.1"  # the protocol has neither keys nor passwords: other machines come in by `ssh -L`
 BACKLOG = 32  # messages that may wait for a client; of a map of 400,000 points each has 8 MB
+MAX_REFUSED = 64  # channels that are remembered: a client may ask for any number
+_SDK = "foxglove.websocket.connected_client"  # its logger
 SETTLE_S = 0.05  # after the SDK has said so, until what is sent reaches who has subscribed
 JPEG_QUALITY = 80
 PATH_PERIOD_S = 1.0  # a long path takes milliseconds to draw
@@ -64,14 +68,15 @@ _MAPS: dict[str, Subject] = {"/map/classes": "map", "/map/colors": "map", "/map/
 class _Camera:
     """Channels of one camera."""
 
-    def __init__(self, camera_id: str, context: foxglove.Context) -> None:
+    def __init__(self, camera_id: str, context: foxglove.Context, path: CameraPath) -> None:
         name = f"/{camera_id}"
         self.rgb = channels.CompressedImageChannel(f"{name}/rgb", context=context)
         self.depth = channels.RawImageChannel(f"{name}/depth", context=context)
         self.semantics = channels.CompressedImageChannel(f"{name}/semantics", context=context)
         self.moving = channels.CompressedImageChannel(f"{name}/moving", context=context)
         self.calibration = channels.CameraCalibrationChannel(f"{name}/calibration", context=context)
-        self.path = CameraPath()
+        self.all = (self.rgb, self.depth, self.semantics, self.moving, self.calibration)
+        self.path = path
 
 
 class FoxgloveServer(Closing):
@@ -83,6 +88,13 @@ class FoxgloveServer(Closing):
     def __init__(self, port: int) -> None:
         context = foxglove.Context()
         self._context = context
+        self._tf = channels.FrameTransformsChannel("/tf", context=context)
+        self._path = channels.SceneUpdateChannel("/path", context=context)
+        self._classes = channels.PointCloudChannel("/map/classes", context=context)
+        self._colors = channels.PointCloudChannel("/map/colors", context=context)
+        self._info = foxglove.Channel("/map/info", schema=_OBJECT, context=context)
+        self._graph = channels.SceneUpdateChannel("/graph", context=context)
+        self._status = foxglove.Channel("/status", schema=STATUS_SCHEMA, context=context)
         listener = _Listener()
         self.requests = listener.requests
         try:
@@ -99,15 +111,10 @@ class FoxgloveServer(Closing):
                 f"port {port} cannot be had ({error}); give another one as `port`, or 0 for any that is free"
             ) from error
         self._cameras: dict[str, _Camera] = {}
+        self._refused = _Refused()
+        logging.getLogger(_SDK).addHandler(self._refused)
         self._labels: LabelSet | None = None
         self._path_sent = 0.0
-        self._tf = channels.FrameTransformsChannel("/tf", context=context)
-        self._path = channels.SceneUpdateChannel("/path", context=context)
-        self._classes = channels.PointCloudChannel("/map/classes", context=context)
-        self._colors = channels.PointCloudChannel("/map/colors", context=context)
-        self._info = foxglove.Channel("/map/info", schema=_OBJECT, context=context)
-        self._graph = channels.SceneUpdateChannel("/graph", context=context)
-        self._status = foxglove.Channel("/status", schema=STATUS_SCHEMA, context=context)
 
     @property
     def url(self) -> str:
@@ -117,6 +124,7 @@ class FoxgloveServer(Closing):
     def close(self) -> None:
         """Serve nobody any more."""
         self._server.stop()
+        logging.getLogger(_SDK).removeHandler(self._refused)
 
     def send_labels(self, label_set: LabelSet) -> None:
         """The classes of the map, before anything that has classes."""
@@ -189,9 +197,27 @@ class FoxgloveServer(Closing):
             self._graph.log(_draw_graph(graph, changes, self._labels, stamp_ns), log_time=stamp_ns)
 
     def _camera(self, camera_id: str) -> _Camera:
-        if camera_id not in self._cameras:
-            self._cameras[camera_id] = _Camera(camera_id, self._context)
-        return self._cameras[camera_id]
+        camera = self._cameras.get(camera_id)
+        if camera is None or not self._refused.ids.isdisjoint(channel.id() for channel in camera.all):
+            for channel in () if camera is None else camera.all:
+                channel.close()
+            path = CameraPath() if camera is None else camera.path
+            camera = self._cameras[camera_id] = _Camera(camera_id, self._context, path)
+        return camera
+
+
+class _Refused(logging.Handler):
+    """Which channels clients were too quick for: the SDK advertises one before it can be subscribed to, and says in its
+    log alone that it has refused somebody; such a channel has to be advertised again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ids: set[int] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """A line of the SDK's log, from one of its threads."""
+        if said := re.search(r"unknown channel: (\d+)", record.getMessage()):
+            self.ids = {*sorted(self.ids)[-MAX_REFUSED:], int(said[1])}
 
 
 class _Listener(foxglove.websocket.ServerListener):

@@ -135,7 +135,7 @@ def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
 
 
 def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
-    """Origin and unit direction in the world of a pixel (2,) of an image with distortion."""
+    """Origin and unit direction in the world of a pixel (2,) of an image with distortion; NaN: it has no ray."""
     direction = T_world_camera[:3, :3] @ np.array((*undistort(xy[None], intrinsics)[0], 1.0))
     return T_world_camera[:3, 3], direction / np.linalg.norm(direction)
 
@@ -152,7 +152,8 @@ def scale_by_board(
     posed = [row for row in seen if row[0] in poses]
     for index, points, pixels in posed:
         for point, xy in zip(points, pixels, strict=True):
-            rays.setdefault(tuple(np.round(point, 6)), []).append(ray_of(poses[index], xy, intrinsics))
+            if np.isfinite((ray := ray_of(poses[index], xy, intrinsics))[1]).all():
+                rays.setdefault(tuple(np.round(point, 6)), []).append(ray)
     corners = {corner: place for corner, of in rays.items() if (place := triangulate(of)) is not None}
     if len(corners) < MIN_BOARD_CORNERS:
         raise ImportSourceError(
@@ -193,6 +194,7 @@ def vertical(
     for index, rows in edges.items():
         if index in poses and len(rows):
             flat = undistort(rows.reshape(-1, 2), intrinsics).reshape(-1, 2, 2)
+            flat = flat[np.isfinite(flat).all(axis=(1, 2))]  # edges beyond the fold of a lens have no place
             rays = np.concatenate((flat, np.ones((*flat.shape[:2], 1))), axis=2)
             normals.append(np.cross(rays[:, 0], rays[:, 1]) @ poses[index][:3, :3].T)
     planes = np.concatenate([np.zeros((0, 3)), *normals])

@@ -28,7 +28,8 @@ class FoxgloveClient(ExitStack):
         super().__init__()
         self._topics = topics
         self._topic_of: list[str] = []  # by subscription
-        self._channels: list[int] = []  # likewise, the server's numbers
+        self._channels: list[int] = []  # likewise, the server's numbers, which are consecutive
+        self._asked_ahead = 0
         opened = connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, compression=None)
         self._socket = self.enter_context(opened)
 
@@ -44,20 +45,23 @@ class FoxgloveClient(ExitStack):
                 said = json.loads(message)
                 if said["op"] == "advertise":
                     self._subscribe(said["channels"])
-                elif said["op"] == "status" and "Unknown channel" in said["message"]:
-                    # the SDK advertises a channel an instant before a client may subscribe to it
-                    self._ask(int(said["message"].rsplit(maxsplit=1)[1]))
             elif message[0] == MESSAGE_DATA:
                 subscription, log_time_ns = struct.unpack_from("<IQ", message, 1)
                 return Received(self._topic_of[subscription], log_time_ns, message[13:])
 
-    def _subscribe(self, channels: list[dict[str, str]]) -> None:
-        wanted = [c for c in channels if self._topics is None or c["topic"] in self._topics]
-        first = len(self._channels)
-        self._topic_of += [channel["topic"] for channel in wanted]
-        self._channels += [int(channel["id"]) for channel in wanted]
-        self._ask(*self._channels[first:])
+    def ask_ahead(self) -> None:
+        """Subscribe, once, to the next channel before it can be: as a client does that is too quick for the SDK."""
+        self._asked_ahead = max(self._channels) + 1
+        self._ask(99, self._asked_ahead)
 
-    def _ask(self, *channels: int) -> None:
-        wanted = [{"id": self._channels.index(channel), "channelId": channel} for channel in channels]
+    def _subscribe(self, channels: list[dict[str, str]]) -> None:
+        for channel in channels:
+            number = int(channel["id"])
+            if (self._topics is None or channel["topic"] in self._topics) and number != self._asked_ahead:
+                self._ask(len(self._channels), number)
+                self._topic_of.append(channel["topic"])
+                self._channels.append(number)
+
+    def _ask(self, subscription: int, channel: int) -> None:
+        wanted = [{"id": subscription, "channelId": channel}]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

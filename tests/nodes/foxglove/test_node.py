@@ -60,6 +60,21 @@ def gather(client: FoxgloveClient, robot: Robot | None, wanted: set[str]) -> dic
     return found
 
 
+def test_a_client_that_was_too_quick_for_the_sdk_receives_a_new_camera_all_the_same(port: int) -> None:
+    frame = tiny_frames(1)[0]
+    with FoxgloveServer(port) as server, FoxgloveClient(server.url) as client:
+        client.receive(0.2)
+        client.ask_ahead()  # for its pictures
+        client.receive(0.2)
+
+        def came() -> bool:
+            server.send_frame(frame, None)
+            received = client.receive(0.05)
+            return received is not None and received.topic == f"/{frame.camera_id}/rgb"
+
+        assert eventually(came, WARM_S)
+
+
 def read_picture(received: Received, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
     picture = CompressedImage.FromString(received.data)
     assert picture.timestamp.ToNanoseconds() == received.log_time_ns
