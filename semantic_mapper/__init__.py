@@ -79,6 +79,8 @@ _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # OpenBLAS reads this once, when numpy is loaded. Its threads spin for 20 ms, and split sums by their number.
 BLAS_THREADS = "numpy" in _sys.modules and "OPENBLAS_NUM_THREADS" not in _os.environ
 _os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# OpenVINO would report its import over the network, by a process that runs the user's script again on Python 3.14.
+_sys.modules.setdefault("openvino_telemetry", None)  # pyright: ignore[reportArgumentType]
 
 _HOMES = {  # modules below this package, by name; where it is called otherwise there, as MODULE:NAME
     "MapClient": "client",
