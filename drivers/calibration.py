@@ -30,7 +30,7 @@ from semantic_mapper.config import (
     read_json,
     read_toml,
 )
-from semantic_mapper.drivers.lens import clear_view, ideal_fisheye_view, lens_intrinsics
+from semantic_mapper.drivers.lens import clear_view, lens_intrinsics
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose, invert_pose
@@ -185,12 +185,10 @@ class Rectifier:
         if not measured.distorted:
             return
         K, lens, size = camera_matrix(measured), np.array(measured.distortion), (measured.width, measured.height)
-        undistort_maps = cv2.initUndistortRectifyMap
+        fisheye = isinstance(measured, FisheyeIntrinsics)
+        undistort_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
         try:
-            if isinstance(measured, FisheyeIntrinsics):
-                undistort_maps, self.intrinsics = cv2.fisheye.initUndistortRectifyMap, ideal_fisheye_view(measured)
-            else:
-                self.intrinsics = clear_view([(measured, np.eye(3))], *size)
+            self.intrinsics = clear_view([(measured, np.eye(3))], *size)
         except FrameError as error:
             raise ConfigError(
                 f"the lens distortion {lens.tolist()} leaves no usable image: {error}; calibrate the camera again"

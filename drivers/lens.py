@@ -21,13 +21,11 @@ _FISHEYE = ("equidistant", "equi", "fisheye", "opencv_fisheye", "fisheye_opencv"
 # Other models of a pinhole camera, of which nothing is left where all coefficients are zero.
 _ZERO_IS_PINHOLE = ("brown_conrady", "inverse_brown_conrady", "modified_brown_conrady", "division")
 
-MAX_HALF_VIEW = np.radians(65.0)  # to each side of what a fisheye's image is cut to: a pinhole stretches what is beyond
 MAX_INVERSE_PX = 1e-6  # by which the ray of a pixel may miss it
 _STEPS, _ROUNDS, _EXACT_PX = 16, 60, 1e-9  # on the way to a pixel; rounds at most at each step, and when one ends
-_FAR = 2.0  # slope beyond which nothing is shown
+_FAR = np.tan(np.radians(65.0))  # to each side: a pinhole stretches what is beyond
 _PARTS = 0.95 ** np.arange(40)  # of a view that are tried
 _EDGE = 1e-4  # of an image's width and height, by which points of its border may miss it
-_THETAS = np.linspace(0.0, np.pi, 4096)
 
 
 def is_fisheye_model(model: str) -> bool:
@@ -82,17 +80,16 @@ def undistort(pixels: Float64, lens: CameraIntrinsics) -> Float64:
         for _ in range(_ROUNDS):
             seen, slant = _bend(slopes, lens)
             off = centre + part * (pixels - centre) - seen
-            rising = _area(slant) > 0
-            slopes[~rising] = np.nan
-            if not (np.abs(off[rising]) > _EXACT_PX).any():
+            area = _area(slant)
+            area[~(area > 0)] = np.nan  # at a fold
+            if not (np.abs(off) > _EXACT_PX)[area > 0].any():
                 break
-            slopes[rising] += np.linalg.solve(slant[rising], off[rising, :, None])[..., 0]
+            (x, y), ((xu, xv), (yu, yv)) = off.T, np.moveaxis(slant, 0, -1)
+            slopes += np.stack((yv * x - xv * y, xu * y - yu * x), axis=1) / area[:, None]
     seen, _ = _bend(slopes, lens)
-    on_the_way = _bend((np.linspace(0, 1, 16)[:, None, None] * slopes).reshape(-1, 2), lens)[1].reshape(
-        -1, len(pixels), 2, 2
-    )
-    good = (np.linalg.norm(seen - pixels, axis=1) <= MAX_INVERSE_PX) & (_area(on_the_way) > 0).all(axis=0)
-    slopes[~good] = np.nan
+    on_the_way = np.linspace(0, 1, 16)[:, None, None] * slopes
+    rising = (_area(_bend(on_the_way.reshape(-1, 2), lens)[1]) > 0).reshape(on_the_way.shape[:2]).all(axis=0)
+    slopes[~(rising & (np.linalg.norm(seen - pixels, axis=1) <= MAX_INVERSE_PX))] = np.nan
     return slopes
 
 
@@ -126,8 +123,11 @@ def clear_view(lenses: Sequence[tuple[CameraIntrinsics, Float64]], width: int, h
         middle, half = (least + most) / 2, part * (most - least) / 2
         rays = _ahead(_border(*(middle - half), *(middle + half)))
         if (half > 0).all() and all(_shows(lens, rays @ R) for lens, R in lenses):
-            focal = (np.array((width, height)) - 1) / (2 * half)
-            return CameraIntrinsics(*focal.tolist(), *(focal * (half - middle)).tolist(), width, height)
+            far = np.array((width - 1, height - 1)) / 2
+            focal = far / half
+            if isinstance(lenses[0][0], FisheyeIntrinsics):  # whose longer side reaches much farther
+                focal[:] = focal.max()
+            return CameraIntrinsics(*focal.tolist(), *(far - focal * middle).tolist(), width, height)
     raise FrameError("no ray lies in the whole of it")
 
 
@@ -154,25 +154,3 @@ def _shows(lens: CameraIntrinsics, rays: Float64) -> bool:
     pixels, _ = _bend(slopes, lens)
     inside = (np.abs(pixels / (np.array((lens.width, lens.height)) - 1) - 0.5) < 0.5 + _EDGE).all()
     return bool(inside and np.abs(undistort(pixels, lens) - slopes).max() < MAX_INVERSE_PX)
-
-
-def ideal_fisheye_view(lens: FisheyeIntrinsics) -> CameraIntrinsics:
-    """The pinhole camera of the same size whose image a fisheye's fills: square pixels, no wider than the lens sees.
-
-    ``FrameError`` where none fits.
-    """
-    distance = _THETAS * (1 + np.polynomial.polynomial.polyval(_THETAS**2, (0.0, *lens.distortion)))
-    rising = int(np.argmax(np.diff(distance, append=-1.0) <= 0)) + 1  # beyond its fold a polynomial means nothing
-
-    def reach(pixels: float, focal: float) -> float:
-        """How far to one side the lens sees, as a slope."""
-        theta = np.interp(max(pixels, 0.0) / focal, distance[:rising], _THETAS[:rising])
-        return float(np.tan(min(theta, MAX_HALF_VIEW)))
-
-    left, right = reach(lens.cx, lens.fx), reach(lens.width - 1 - lens.cx, lens.fx)
-    up, down = reach(lens.cy, lens.fy), reach(lens.height - 1 - lens.cy, lens.fy)
-    seen = min(left + right, up + down) > 0
-    focal = max((lens.width - 1) / (left + right), (lens.height - 1) / (up + down)) if seen else 0.0
-    cx = (lens.width - 1) / 2 + focal * (left - right) / 2
-    cy = (lens.height - 1) / 2 + focal * (up - down) / 2
-    return CameraIntrinsics(focal, focal, cx, cy, lens.width, lens.height)

@@ -20,6 +20,7 @@ from semantic_mapper.drivers.oak.devices import list_devices as list_devices
 from semantic_mapper.drivers.oak.devices import load_depthai
 from semantic_mapper.drivers.oak.odometry import Odometry
 from semantic_mapper.errors import CameraError, FrameError, PoseError
+from semantic_mapper.geometry import rotation_vector
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
@@ -27,7 +28,7 @@ QUEUE = 4  # images that wait where the reader is slow; the oldest gives way, wh
 ODOMETRY_WAIT_S = 0.3  # how long an image waits for its pose; then it goes without
 DEPTH_UNIT_M = 1e-3  # the stereo node's default
 NO_DEPTH = 65535  # beyond what 16 bits hold
-ALIGNED_PX = 1.0  # within which intrinsics of depth and colour are the same
+ALIGNED_PX, ALIGNED_M, ALIGNED_DEG = 1.0, 0.005, 0.3  # within which depth and colour are seen by the same camera
 
 
 def open_camera(config: Config, camera_id: str, connect: Callable[[Config], Sources] = connect_device) -> LiveCamera:
@@ -148,7 +149,7 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
     scale = max(width / size[0], height / size[1])
     K = scale * np.array(K)
     K[:2, 2] -= (scale * np.array(size) - (width, height)) / 2
-    return _pinhole(K, width, height)
+    return CameraIntrinsics(*K.diagonal()[:2].tolist(), *K[:2, 2].tolist(), width, height)
 
 
 def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
@@ -158,13 +159,10 @@ def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
     """
     transformation = frame.getTransformation()
     K = np.array(transformation.getIntrinsicMatrix(), np.float64)
-    if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not (np.diag(K) > 0).all():
+    focal = np.linalg.norm(K[:2, :2], axis=1)  # also of a picture that was turned or mirrored
+    if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not focal.all():
         return None
-    return _pinhole(K, *transformation.getSize())
-
-
-def _pinhole(K: Any, width: int, height: int) -> CameraIntrinsics:
-    return CameraIntrinsics(float(K[0][0]), float(K[1][1]), float(K[0][2]), float(K[1][2]), width, height)
+    return CameraIntrinsics(*focal.tolist(), *K[:2, 2].tolist(), *transformation.getSize())
 
 
 def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:
@@ -172,12 +170,28 @@ def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:
     if any(rgb.getTransformation().getDistortionCoefficients()):
         return ["the device says that its images are not undistorted: surfaces may bend"]
     ours, theirs = reported_intrinsics(rgb), None if depth is None else reported_intrinsics(depth)
-    if ours is None or theirs is None:
+    if ours is None:
         return []
-    a, b = (np.array((c.fx, c.fy, c.cx, c.cy, c.width, c.height)) for c in (ours, theirs))
-    if np.abs(a - b).max() <= ALIGNED_PX:
-        return []
-    return [f"depth may not be aligned with colour: the device says {theirs} of the one and {ours} of the other"]
+    first = rgb.getTransformation()
+    (a, b), (c, d) = np.array(first.getIntrinsicMatrix())[:2, :2]
+    turned = "the device turns or mirrors its pictures: poses of its own tracking are of those before"
+    troubles = [turned] if min(a, d) <= 0 or max(abs(b), abs(c)) > ALIGNED_PX else []
+    if theirs is None:
+        return troubles
+    a, b = (np.array((k.fx, k.fy, k.cx, k.cy, k.width, k.height)) for k in (ours, theirs))
+    if np.abs(a - b).max() > ALIGNED_PX:
+        both = f"{theirs} of the one and {ours} of the other"
+        troubles.append(f"depth may not be aligned with colour: the device says {both}")
+    try:  # not compared by isAlignedTo
+        meter = load_depthai().LengthUnit.METER
+        T = np.array(first.getExtrinsicsTransformationMatrixTo(depth.getTransformation(), sourceUnit=meter))
+    except RuntimeError:  # one of them does not say where it is
+        return troubles
+    apart_m, apart_deg = np.linalg.norm(T[:3, 3]), np.degrees(np.linalg.norm(rotation_vector(T)))
+    if apart_m > ALIGNED_M or apart_deg > ALIGNED_DEG:
+        apart = f"{1000 * apart_m:.0f} mm and {apart_deg:.1f} degrees apart"
+        troubles.append(f"depth may not be aligned with colour: the device says that they are {apart}")
+    return troubles
 
 
 def rgb_pixels(frame: Any) -> UInt8:

@@ -122,12 +122,12 @@ def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None
         )
     centers, truth = T_model_camera[rows, :3, 3], east_north_up(known, known[0])
     spread_m = float(np.sqrt(((truth - truth.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    length, width, _ = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
-    if not (spread_m > 0 and length > 0):
+    if not (spread_m > 0 and np.ptp(centers, axis=0).any()):
         raise ImportSourceError("the GPS positions are one and the same")
-    if width < MIN_WIDTH * length:
-        raise ImportSourceError("the pictures lie on a line, about which GPS tells no roll; take some off it")
     inside = _consensus(centers, truth)
+    length, width, _ = np.linalg.svd(centers[inside] - centers[inside].mean(axis=0), compute_uv=False)
+    if width < MIN_WIDTH * length:
+        raise ImportSourceError("the pictures that GPS agrees with lie on a line, and it tells no roll about that")
     T, scale = align_similar(centers[inside], truth[inside])
     error_m = float(np.median(_errors(T, scale, centers, truth)))
     if error_m > MAX_ERROR * spread_m:

@@ -8,7 +8,7 @@ import pytest
 
 from semantic_mapper.drivers import live
 from semantic_mapper.drivers.base import Camera, CameraImage
-from semantic_mapper.drivers.oak.camera import open_camera
+from semantic_mapper.drivers.oak.camera import geometry_troubles, open_camera, reported_intrinsics
 from semantic_mapper.drivers.oak.device import Sources
 from semantic_mapper.errors import CameraError
 from tests.drivers.oak import host
@@ -84,6 +84,27 @@ def test_intrinsics_that_the_images_carry_count_more_than_the_calibration(calibr
     with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
         (trouble,) = camera.warnings
     assert "not be aligned" in trouble
+
+
+def test_depth_of_a_camera_elsewhere_and_turned_pictures_are_said() -> None:
+    def seen(x_cm: float = 0.0, turned_deg: float = 0.0) -> dai.ImgFrame:
+        shown, pose = dai.ImgTransformation(WIDTH, HEIGHT, [[70.0, 0, 30], [0, 70, 20], [0, 0, 1]]), dai.Extrinsics()
+        shown.addRotation(turned_deg, dai.Point2f(WIDTH / 2, HEIGHT / 2))
+        pose.rotationMatrix, pose.translation = np.eye(3).tolist(), dai.Point3f(x_cm, 0, 0)
+        pose.lengthUnit, pose.toCameraSocket = dai.LengthUnit.CENTIMETER, dai.CameraBoardSocket.CAM_A
+        shown.setExtrinsics(pose)
+        frame = dai.ImgFrame()
+        frame.setTransformation(shown)
+        return frame
+
+    assert geometry_troubles(seen(), seen()) == geometry_troubles(seen(), seen(0.2)) == []
+    (trouble,) = geometry_troubles(seen(), seen(7.5))
+    assert "not be aligned" in trouble and "75 mm and 0.0 degrees apart" in trouble
+    turned = seen(turned_deg=180)
+    (trouble,) = geometry_troubles(turned, turned)
+    assert "turns or mirrors" in trouble
+    lens = reported_intrinsics(turned)
+    assert lens is not None and np.allclose((lens.fx, lens.fy, lens.cx, lens.cy), (70, 70, WIDTH - 30, HEIGHT - 20))
 
 
 def test_lost_and_damaged_messages_doubles_and_those_of_the_future_are_gaps(calibration: Path) -> None:

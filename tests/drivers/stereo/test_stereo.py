@@ -122,6 +122,13 @@ def test_what_the_right_camera_does_not_see_has_no_depth() -> None:
     assert (depth[inner, :far] == 0).all()  # left of the right camera's image
 
 
+def test_rectified_images_of_wide_lenses_show_nothing_from_beside_them() -> None:
+    wide = dataclasses.replace(LEFT, fx=200.0, fy=200.0, distortion=(-0.28, 0.09, 0.001, -0.0005, 0.0))
+    white = np.full((360, 480, 3), 255, np.uint8)
+    rectified = StereoDepth(StereoCalibration(wide, wide, np.linalg.inv(T_left_right())), 480, 0.4, 8.0)
+    assert min(image.min() for image in rectified.rectify(white, white)) > 250
+
+
 def shift(x: float) -> Float64:
     T = np.eye(4)
     T[0, 3] = x

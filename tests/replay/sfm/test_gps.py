@@ -67,7 +67,11 @@ def test_positions_that_are_few_on_a_line_or_contradict_the_pictures_are_refused
     way, up = flight(), np.eye(3)[2]
     line = np.stack([look_at(np.array((n, 0.0, 30.0)), np.array((n, 9.0, 0.0)), up) for n in range(8)])
     few = [*positions_of(way[:3, :3, 3]), *[None] * (len(way) - 3)]
+    beside, wrong = np.tile(line, (2, 1, 1)), rng.normal(0, 0.02, (16, 3))  # pictures beside a line, wrong GPS of these
+    beside[8:, 0, 3] += 8.0
+    beside[[3, 9], 1, 3], wrong[[3, 9]] = (6.0, -6.0), ((40.0, 25.0, 30.0), (-35.0, 30.0, -20.0))
     for poses, known, says in (
+        (beside, positions_of(beside[:, :3, 3] + wrong), "line"),
         (way, few, "3 of 12 pictures have a GPS position"),
         (line, positions_of(line[:, :3, 3]), "line"),
         (way, positions_of(rng.normal(0, 20, (len(way), 3))), "off"),

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -53,6 +55,13 @@ def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:
     guess = np.array((0.3, -0.3, 1.0))
     found = vertical(edges, poses, plain, guess)
     assert found is not None and np.degrees(np.arccos(found @ UP)) < 0.3
+    # A lens that folds has no ray for the picture's corner.
+    slopes = {n: (rows.reshape(-1, 2, 2) - (159.5, 119.5)) / 300 for n, rows in edges.items()}
+    inner = {n: at[(np.linalg.norm(at, axis=2) < 0.7).all(axis=1)] for n, at in slopes.items()}
+    bent = {n: 300 * at * (1 - 0.5 * (at**2).sum(axis=2, keepdims=True)) + (159.5, 119.5) for n, at in inner.items()}
+    with_corner = {n: np.concatenate((at.reshape(-1, 4), [(0.0, 0.0, 1.0, 30.0)])) for n, at in bent.items()}
+    found = vertical(with_corner, poses, replace(plain, distortion=(-0.5, 0.0, 0.0, 0.0)), guess)
+    assert found is not None and np.degrees(np.arccos(found @ UP)) < 0.3
     random = {n: rng.uniform(0, 240, (40, 4)) for n in poses}
     assert vertical({0: random[0][:5]}, poses, plain, guess) is None
 
@@ -87,6 +96,9 @@ def test_a_board_tells_the_scale() -> None:
     assert found == pytest.approx(scaled, rel=0.01) and "board" in how
     with pytest.raises(ImportSourceError, match="board tells no scale"):
         scale_by_board(seen, {0: poses[0]}, camera)
+    beyond = [(n, points, np.zeros_like(pixels)) for n, points, pixels in seen]  # the fold of a lens
+    with pytest.raises(ImportSourceError, match="board tells no scale"):
+        scale_by_board(beyond, poses, replace(camera, distortion=(-0.9, 0.0, 0.0, 0.0)))
 
 
 def test_ranges_follow_a_scene_that_is_larger_than_a_room_and_given_settings_stay() -> None:
