@@ -5,7 +5,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
-PYTHONS ?= 3.11 3.12 3.13
+PYTHONS ?= 3.11 3.12 3.13 3.14
 READY := .venv/.ready
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
@@ -49,11 +49,12 @@ test-slow: $(READY)  ## run the slow tests: crash rounds, launches, learning, tr
 test-research: $(READY)  ## run the tests of research/
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest research/tests -n 2 --dist worksteal --max-worker-restart 0
 
-nightly: $(READY)  ## run all tests, those of research, and everything on bare machines
+nightly: $(READY)  ## run all tests, those of research, and everything on bare machines and with other Pythons
 	$(PYTEST)
 	$(MAKE) test-research
 	tools/bare_machine.sh "make demo && make test"
 	tools/bare_machine.sh --suite forky "make demo && make test"
+	$(MAKE) test-matrix
 	tools/bare_machine.sh "make slim && du -sm .venv && make demo && .venv/bin/semantic-mapper doctor"
 
 test-matrix: $(READY)  ## run the quick tests with each of PYTHONS, with the oldest packages and the newest
