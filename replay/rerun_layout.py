@@ -13,16 +13,7 @@ import rerun.blueprint as rrb
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.plots import (
-    DIM_TEXT,
-    class_rows,
-    new_figure,
-    place,
-    put_legend,
-    put_picture,
-    put_text,
-    rendered,
-)
+from semantic_mapper.plots import DIM_TEXT, class_rows, new_figure, place, put_legend, put_picture, put_text, rendered
 from semantic_mapper.replay.overview import from_angle, open_side
 from semantic_mapper.types import Bool, Float32, Float64, UInt8
 

@@ -47,7 +47,5 @@ def replay_log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
     make = importlib.import_module("semantic_mapper.replay.testing").LogReplays
     config = request.config
     return make(
-        config.rootpath,
-        lambda name: tmp_path_factory.mktemp(f"replay-{name}-"),
-        update=bool(config.getoption(_UPDATE)),
+        config.rootpath, lambda name: tmp_path_factory.mktemp(f"replay-{name}-"), update=bool(config.getoption(_UPDATE))
     )

@@ -9,14 +9,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.files import (
-    atomic_folder,
-    atomic_write,
-    open_unlinked,
-    read_regular,
-    remove_stale,
-    write_bytes,
-)
+from semantic_mapper.files import atomic_folder, atomic_write, open_unlinked, read_regular, remove_stale, write_bytes
 
 
 def test_a_regular_file_is_read_up_to_the_limit(tmp_path: Path) -> None:

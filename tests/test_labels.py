@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import LabelError
-from semantic_mapper.labels import (
-    NYU40,
-    PROVIDED,
-    SCANNET20,
-    STUFF_NAMES,
-    LabelSet,
-    make_label_set,
-)
+from semantic_mapper.labels import NYU40, PROVIDED, SCANNET20, STUFF_NAMES, LabelSet, make_label_set
 
 GAPS = make_label_set("gaps", ["wall", "chair", "lamp"], ids=[9, 2, 200], ignore_id=255)
 RED = (255, 0, 0)

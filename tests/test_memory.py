@@ -12,10 +12,7 @@ from tests.nodes.support import COMMAND, error_line
     [
         (MemoryError(), True),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), True),
-        (
-            RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
-            True,
-        ),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"), True),
         (OSError(12, "Cannot allocate memory"), True),
         (RuntimeError("Exception from plugin.cpp:54:\nResource temporarily unavailable"), True),
         (BlockingIOError(11, "Resource temporarily unavailable"), False),

@@ -44,11 +44,7 @@ class StereoDepth:
             )
         lenses = [(camera_matrix(k), np.array(k.distortion or (0.0,) * 5)) for k in (left, right)]
         R_left, R_right = cv2.stereoRectify(
-            *lenses[0],
-            *lenses[1],
-            (left.width, left.height),
-            pair.T_right_left[:3, :3],
-            offset.reshape(3, 1),
+            *lenses[0], *lenses[1], (left.width, left.height), pair.T_right_left[:3, :3], offset.reshape(3, 1)
         )[:2]
         turned = [(left, np.asarray(R_left)), (right, np.asarray(R_right))]
         try:  # OpenCV's own view may reach beyond the images

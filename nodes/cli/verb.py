@@ -185,11 +185,7 @@ class MapperSettings(SettingOptions):
     """Settings of the mapper."""
 
     kind = MapperConfig
-    options: ClassVar = {
-        "--voxel-size": "voxel_map.voxel_size_m",
-        "--quality": "quality",
-        "--depth": "depth.source",
-    }
+    options: ClassVar = {"--voxel-size": "voxel_map.voxel_size_m", "--quality": "quality", "--depth": "depth.source"}
 
     @wrong_usage()
     def load(self, defaults: Mapping[str, Any] | None = None) -> MapperConfig:

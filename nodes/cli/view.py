@@ -63,7 +63,7 @@ def view(
             f"{path}: is a log; `semantic-mapper map {shlex.quote(str(path))} --view` shows it while it is mapped"
         )
     refuse_options(
-        (remote.server and "://" not in source, "--server", "goes with an endpoint such as tcp://robot:5570"),
+        (remote.server and "://" not in source, "--server", "goes with an endpoint such as tcp://robot:5570")
     )
     live = None if saved else _find_live(source, remote)
     from semantic_mapper.nodes.viewer.sources import REFRESH_S, show_live, show_saved

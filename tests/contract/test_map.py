@@ -17,16 +17,7 @@ from scipy.spatial import KDTree
 from semantic_mapper.fields.weights import default_checkpoint_path
 from tests.contract import entry_points as api
 from tests.contract.golden import LOG, POINTS, REFUSED_SEQ, WEIGHTS, digest, form, lacking, read
-from tests.contract.runs import (
-    Points,
-    flat,
-    load_points,
-    numbers_of,
-    read_ply,
-    replay_kitchen,
-    replay_room,
-    summary_of,
-)
+from tests.contract.runs import Points, flat, load_points, numbers_of, read_ply, replay_kitchen, replay_room, summary_of
 
 VOXEL_M = 0.05
 # Number: largest difference. What is not named must be equal.

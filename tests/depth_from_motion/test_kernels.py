@@ -5,18 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from semantic_mapper.depth_from_motion.estimate import TOLERANCE, find_agreement, relax_membrane
-from semantic_mapper.depth_from_motion.sweep import (
-    HINT_COST,
-    UNSEEN_COST,
-    inverse_depths,
-    sweep_and_match,
-)
-from semantic_mapper.depth_from_motion.views import (
-    DepthEstimate,
-    PreparedView,
-    enlarge_estimate,
-    prepare_view,
-)
+from semantic_mapper.depth_from_motion.sweep import HINT_COST, UNSEEN_COST, inverse_depths, sweep_and_match
+from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView, enlarge_estimate, prepare_view
 from semantic_mapper.geometry import invert_pose
 from tests.depth_from_motion.pictures import plane_frame
 

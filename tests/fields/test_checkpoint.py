@@ -10,12 +10,7 @@ from safetensors.torch import save_file
 
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.weights import (
-    anchor_from_frame,
-    encode_alike,
-    load_weights,
-    weights_bytes,
-)
+from semantic_mapper.fields.weights import anchor_from_frame, encode_alike, load_weights, weights_bytes
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapper import Mapper
 from tests.small import tiny_field, tiny_frames

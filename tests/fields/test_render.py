@@ -6,11 +6,7 @@ import pytest
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.base import Rays, Rendered
-from semantic_mapper.fields.render import (
-    View,
-    render_sparse_view,
-    render_view,
-)
+from semantic_mapper.fields.render import View, render_sparse_view, render_view
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import CameraIntrinsics
 

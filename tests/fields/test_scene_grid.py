@@ -4,12 +4,7 @@ import torch
 
 from semantic_mapper.config import GridConfig, GridFieldConfig
 from semantic_mapper.fields.learned import build_field
-from semantic_mapper.fields.scene.grid import (
-    NOTHING,
-    GridField,
-    RaySamples,
-    at_resolution,
-)
+from semantic_mapper.fields.scene.grid import NOTHING, GridField, RaySamples, at_resolution
 from semantic_mapper.fields.views import EncodedViews
 from tests.fields.scene import WALL_M, pose_at, wall_colour, wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, assert_unknown

@@ -10,12 +10,7 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import make_pose
 from semantic_mapper.labels import KITTI360, ROOMS
-from semantic_mapper.mapping.moving import (
-    SETTLED_S,
-    MotionDetector,
-    MovingFilter,
-    MovingSpace,
-)
+from semantic_mapper.mapping.moving import SETTLED_S, MotionDetector, MovingFilter, MovingSpace
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.test_voxel_map import same

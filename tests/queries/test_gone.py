@@ -135,10 +135,7 @@ def test_a_client_gets_what_is_gone_and_its_mirror_keeps_no_ghost(tmp_path_facto
             pass
         return things
 
-    with (
-        answering(f"ipc://{folder / 'q'}", stage.map) as service,
-        MapClient(service.endpoint, timeout_s=60) as client,
-    ):
+    with answering(f"ipc://{folder / 'q'}", stage.map) as service, MapClient(service.endpoint, timeout_s=60) as client:
         stage.show(WHOLE, times=10)
         (table,) = answered(client, gone=True)
         assert table.gone_ns is None and thing_points(client.mirror().snapshot()) > 100

@@ -11,13 +11,7 @@ from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.queries.instances import (
-    Instance,
-    InstanceTracker,
-    find_components,
-    thing_voxels,
-    upright_box,
-)
+from semantic_mapper.queries.instances import Instance, InstanceTracker, find_components, thing_voxels, upright_box
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.snapshot import MapMirror
 from semantic_mapper.types import UInt8

@@ -152,11 +152,7 @@ def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights
         ("auto", without, "needs exact poses"),
         ("auto", frames, "check depth_scale, the intrinsics and the poses"),
         ("auto", far, "in 6 of 6 frames most of the depth is beyond the range of the map"),
-        (
-            "auto",
-            limit,
-            "in 6 of 6 frames most of the computed depth is beyond 5 m, where the range",
-        ),
+        ("auto", limit, "in 6 of 6 frames most of the computed depth is beyond 5 m, where the range"),
     ):
         summary = finish_session(run(weights, frames_in, depth=depth), tmp_path)
         said = summary["map"]["nearly_empty"]

@@ -20,9 +20,7 @@ from tests.small import settled_field, tiny_field, tiny_frames
 
 FRAMES = tiny_frames(8)
 CONFIG = convert_config(
-    {"finetune": {"steps": 6, "width": 96, "held_out_rays": 64, "step": {"rays": 128}}},
-    OnlineConfig,
-    "test",
+    {"finetune": {"steps": 6, "width": 96, "held_out_rays": 64, "step": {"rays": 128}}}, OnlineConfig, "test"
 )
 
 

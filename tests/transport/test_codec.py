@@ -29,13 +29,7 @@ from semantic_mapper.transport.codec import (
     repack_rgb,
     unpack_parts,
 )
-from semantic_mapper.transport.images import (
-    CodecOptions,
-    depth_from_uint16,
-    depth_to_uint16,
-    encode_uint8,
-    sniff_image,
-)
+from semantic_mapper.transport.images import CodecOptions, depth_from_uint16, depth_to_uint16, encode_uint8, sniff_image
 from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES, LabelledKeyframe, WeightsUpdate
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 

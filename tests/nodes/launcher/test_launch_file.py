@@ -168,11 +168,7 @@ def test_mistakes_with_several_cameras_are_named(tmp_path: Path) -> None:
         (["eyes.log=x"], ("", ""), "no node is called 'eyes'; did you mean `eye`?"),
         (["eye"], ("", ""), "--set eye: write NAME=VALUE"),
         (["eye.rate=fast"], ("", ""), "`rate`: must be a number, not a text"),
-        (
-            ["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"],
-            ("", ""),
-            "`config` is a value, not a table",
-        ),
+        (["eye.kind=v4l2", "eye.config=a.toml", "eye.config.fps=3"], ("", ""), "`config` is a value, not a table"),
         (["restart=on-failure", "eye.mode=fast"], ("", ""), "'eye' is to be restarted, but camera 'eye' waits"),
         (["restart=always"], ("", ""), "'always' is not valid"),
         ([], ('input = "eye"', 'input = "eyes"'), "did you mean `eye`?"),

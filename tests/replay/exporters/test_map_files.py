@@ -58,10 +58,7 @@ def test_formats_and_directions_are_read_from_words() -> None:
 
 def test_options_that_a_format_cannot_honour_are_refused(corner: VoxelMap, tmp_path: Path) -> None:
     for request, message in (
-        (
-            ExportRequest("rrd", color="class"),
-            "--color means nothing for format rrd; it is for ply, ply-mesh, glb",
-        ),
+        (ExportRequest("rrd", color="class"), "--color means nothing for format rrd; it is for ply, ply-mesh, glb"),
         (ExportRequest("ply-mesh", up=AXES["z"]), "--up means nothing for format ply-mesh"),
         (ExportRequest("glb", height=(0.1, 1)), "--height"),
     ):
@@ -138,10 +135,7 @@ def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: Voxe
     corner.save(tmp_path / "map.npz")
     unknown = VoxelMap.load(tmp_path / "map.npz")
     unknown.note_scale(False)
-    for name, where in (
-        ("a.ply", "comment scale: unknown"),
-        ("a.glb", '"scale":"unknown"'),
-    ):
+    for name, where in (("a.ply", "comment scale: unknown"), ("a.glb", '"scale":"unknown"')):
         report = export_map(unknown, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
         assert report.found[-1] == "scale: unknown; lengths are not metres"
         assert where.encode() in (tmp_path / name).read_bytes()

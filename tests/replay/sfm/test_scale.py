@@ -10,12 +10,7 @@ from semantic_mapper.drivers.poses.board import BoardFinder, make_board
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import invert_pose, look_at, make_pose, project, transform
-from semantic_mapper.replay.sfm.scale import (
-    fit_to_scene,
-    scale_by_board,
-    scene_depth,
-    vertical,
-)
+from semantic_mapper.replay.sfm.scale import fit_to_scene, scale_by_board, scene_depth, vertical
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
