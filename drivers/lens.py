@@ -103,7 +103,6 @@ def _bend(slopes: Float64, lens: CameraIntrinsics) -> tuple[Float64, Float64]:
 
 
 def _area(slant: Float64) -> Float64:
-    """Determinants of (..., 2, 2)."""
     return slant[..., 0, 0] * slant[..., 1, 1] - slant[..., 0, 1] * slant[..., 1, 0]
 
 
@@ -112,13 +111,12 @@ def clear_view(lenses: Sequence[tuple[CameraIntrinsics, Float64]], width: int, h
 
     ``lenses`` have turns R_view_lens (3, 3) of their axes. Raises FrameError: they have next to nothing in common.
     """
-    boxes: list[Float64] = []  # slopes to the left, up, right, down
+    least, most = np.full(2, -_FAR), np.full(2, _FAR)  # slopes to the left and up, to the right and down
     for lens, R in lenses:
         rays = _ahead(undistort(_border(0, 0, lens.width - 1, lens.height - 1), lens)) @ R.T
-        left, up, right, down = np.split(rays[:, :2] / rays[:, 2:], 4)  # NaN where the lens folds before its edge
-        least, most = np.fmax.reduce((left[:, 0], up[:, 1]), axis=1), np.fmin.reduce((right[:, 0], down[:, 1]), axis=1)
-        boxes.append(np.nan_to_num(np.concatenate((np.fmax(least, -_FAR), np.fmin(most, _FAR)))))
-    least, most = np.max(boxes, axis=0)[:2], np.min(boxes, axis=0)[2:]
+        up, right, down, left = np.split(rays[:, :2] / rays[:, 2:], 4)  # NaN where the lens folds before its edge
+        least = np.fmax(least, np.fmax.reduce((left[:, 0], up[:, 1]), axis=1))
+        most = np.fmin(most, np.fmin.reduce((right[:, 0], down[:, 1]), axis=1))
     for part in _PARTS:  # the first, but for lenses that fold
         middle, half = (least + most) / 2, part * (most - least) / 2
         rays = _ahead(_border(*(middle - half), *(middle + half)))
@@ -132,15 +130,9 @@ def clear_view(lenses: Sequence[tuple[CameraIntrinsics, Float64]], width: int, h
 
 
 def _border(left: float, up: float, right: float, down: float) -> Float64:
-    """Points (4 N, 2) on the edges of a box: left, upper, right, lower."""
-    x, y = np.linspace((left, up), (right, down), 129).T
-    edges = (
-        (np.full_like(x, left), y),
-        (x, np.full_like(x, up)),
-        (np.full_like(x, right), y),
-        (x, np.full_like(x, down)),
-    )
-    return np.concatenate([np.stack(edge, axis=1) for edge in edges])
+    """Points (4 N, 2) on the edges of a box: upper, right, lower, left."""
+    corners = np.array(((left, up), (right, up), (right, down), (left, down)))
+    return np.concatenate([np.linspace(*edge, 129) for edge in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 def _ahead(slopes: Float64) -> Float64:

@@ -189,7 +189,6 @@ def _nearly_empty(session: MapSession, points: int) -> str | None:
 
 
 def _summarize(session: MapSession, points: MapPoints) -> dict[str, Any]:
-    """The summary as plain data."""
     pipeline, mapper = session.pipeline, session.mapper
     voxel_map, label_set, poses = pipeline.voxel_map, pipeline.label_set, pipeline.pose_check
     domain = pipeline.domain_check
@@ -302,7 +301,6 @@ def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
 
 
 def _percentiles(times: LatencyHistogram) -> dict[str, float | None]:
-    """Median and 95th percentile, null for nothing."""
     return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
 
 

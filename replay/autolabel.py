@@ -189,8 +189,6 @@ def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope
 
 @dataclass(slots=True, eq=False)
 class _Message:
-    """A message on its way to the new log."""
-
     writer: LogWriter  # of the part that it belongs to
     envelope: Envelope
     parts: list[bytes]

@@ -147,7 +147,6 @@ def _distances(a: VoxelMap, b: VoxelMap) -> tuple[float | None, float | None]:
 
 
 def _names(voxel_map: VoxelMap) -> NDArray[np.str_]:
-    """Class name of each id 0..255."""
     names = dict(zip(voxel_map.label_set.ids, voxel_map.label_set.names, strict=True))
     return np.array([names.get(i, "unknown") for i in range(256)])
 

@@ -157,7 +157,6 @@ def _fit(
     seen: frozenset[int],
     kind: str,
 ) -> Checkpoint:
-    """Fit, with progress."""
     monitor.start(100)
 
     def on_progress(progress: FitProgress) -> None:
@@ -235,7 +234,6 @@ def compute_depths(
 
 
 def _go_on(monitor: JobMonitor, done: int, note: str) -> None:
-    """Report progress."""
     monitor.set(done, note)
     if monitor.stopped_by:
         raise KeyboardInterrupt

@@ -53,7 +53,6 @@ def memory_message(error: BaseException) -> str:
 
 
 def _with_causes(error: BaseException) -> list[BaseException]:
-    """The error and those that led to it."""
     errors: list[BaseException] = []
     following: BaseException | None = error
     while following is not None and following not in errors:

@@ -122,7 +122,6 @@ class OdometryPoseSource(PoseSource):
         self._begin_world(closes_loops=config.loop_closure)
 
     def _begin_world(self, closes_loops: bool) -> None:
-        """Forget all keyframes and poses."""
         self._graph = KeyframeGraph()
         self._closer = LoopCloser(self._graph, self._counters) if closes_loops else None
         self._past: list[StampedPose] = []  # the last two poses

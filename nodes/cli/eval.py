@@ -126,7 +126,6 @@ def _compare(output: JsonOutput, a: Path, b: Path, tolerances: Tolerances) -> in
 
 
 def _surface_line(figures: dict[str, Any]) -> str:
-    """One sentence about a map and a mesh."""
     labels = "" if figures["mesh_miou"] is None else f", mIoU at its vertices {percent(figures['mesh_miou'])}"
     return (
         f"surface {figures['median_m'] * 1000:.1f} mm (median) from the mesh, {percent(figures['complete'])} of the "

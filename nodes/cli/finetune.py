@@ -95,7 +95,6 @@ def finetune(
 
 
 def _recipe_lines(recipe: dict[str, Any], chosen: int) -> list[str]:
-    """What was learned, for a reader."""
     lines: list[str] = []
     if "psnr" in recipe:
         psnr = "no held-out views rendered" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"

@@ -243,7 +243,6 @@ def _live_info(output: Output, place: str, remote: Remote) -> dict[str, Any]:
 
 
 def _weights_file_info(output: Output, path: Path) -> dict[str, Any]:
-    """What a file of weights says of itself."""
     from semantic_mapper.fields.weights import open_weights, refusing_damage, unpack_label_set
 
     _, metadata = open_weights(path)

@@ -273,7 +273,6 @@ def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tupl
 
 
 def _relocalize(output: Output, source: str, log: Path, every: int, *, live: bool) -> dict[str, Any]:
-    """Find the frames of a log in a saved map."""
     if live:
         raise ConfigError(
             f"{source}: is a running mapper; frames are found in a saved map (`up --set mapper.map=FILE` goes on there)"

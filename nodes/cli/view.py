@@ -89,7 +89,6 @@ def _find_live(source: str, remote: Remote) -> Live:
 
 
 def _show_status(output: Output, place: str, remote: Remote, *, once: bool) -> None:
-    """A running launch as a table."""
     endpoint = socket_in_launch(place, STATUS_SOCKET)
     with NewestSubscriber(endpoint, ("status",), identity=remote.identity()) as subscriber:
         view = running.LaunchView.whole(subscriber)

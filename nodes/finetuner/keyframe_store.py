@@ -34,8 +34,6 @@ _log = structlog.get_logger(__name__)
 
 
 class _KeptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A keyframe on disk, see ``Kept``."""
-
     digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256 of the file
     held_out: bool
     validated: bool = False

@@ -96,7 +96,6 @@ class Tables:
 
 
 def _rows(store: Store) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Rows with the tables that they belong to."""
     for result in store.results():
         key, found = result.key, result.findings
         named = [("", found.metrics), ("cost_", found.costs), ("tag_", result.tags)]

@@ -228,7 +228,6 @@ def _count(reference: Any, report: RunReport) -> str:
 
 
 def _read_weights(weights: str) -> tuple[str, bytes]:
-    """Name and content."""
     with tempfile.TemporaryDirectory() as folder, reaching(weights):
         local = fetch(weights, Path(folder) / _name_of(weights))
         data = local.read_bytes()

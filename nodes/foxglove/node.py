@@ -90,7 +90,6 @@ def run_foxglove(context: NodeContext, options: FoxgloveOptions) -> None:
 
 
 def _hand_on(parts: list[bytes], server: FoxgloveServer, sender: _MapSender, streams: Streams, poses: MapPoses) -> None:
-    """One message of a node."""
     envelope = read_envelope(parts)
     match envelope.topic:
         case "frame":

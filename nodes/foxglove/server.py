@@ -66,8 +66,6 @@ _MAPS: dict[str, Subject] = {"/map/classes": "map", "/map/colors": "map", "/map/
 
 
 class _Camera:
-    """Channels of one camera."""
-
     def __init__(self, camera_id: str, context: foxglove.Context, path: CameraPath) -> None:
         name = f"/{camera_id}"
         self.rgb = channels.CompressedImageChannel(f"{name}/rgb", context=context)

@@ -258,7 +258,6 @@ class MapperNode(Closing):
             self._report.publish(state, self._own_status(), *(part.status() for part in parts if part is not None))
 
     def _own_status(self) -> PartStatus:
-        """Of the stream and the pipeline."""
         counters = {"rejected": self._frames.rejected, "early": self._early, "missed": self._missing_frames.missed}
         pipeline, warnings = self._pipeline, [self._resumed]
         if (session := self._session) is not None:

@@ -207,7 +207,6 @@ def keep_earlier(context: NodeContext, path: Path) -> None:
 
 
 def _identity(path: Path) -> str:
-    """Tells one file of this name from the next."""
     try:
         stat = path.stat()
     except FileNotFoundError:

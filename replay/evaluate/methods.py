@@ -69,8 +69,6 @@ class Evaluation:
 
 
 class _Scores:
-    """Of one method."""
-
     def __init__(self, label_set: LabelSet) -> None:
         self.confusion = ConfusionMatrix(label_set)
         self.confidence = ConfidenceScores()

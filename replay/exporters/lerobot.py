@@ -121,7 +121,6 @@ class LeRobotExporter:
         return found
 
     def _flush(self) -> None:
-        """Write the frames that are in memory."""
         pa = self._pa
         if self._writer is None:
             steps = np.diff(self._stamps)

@@ -58,8 +58,6 @@ def open_rosbag(src: Path, options: ImportOptions) -> PosedPictures:
 
 
 class _BagReader:
-    """Finds out what a bag holds, step by step."""
-
     def __init__(self, src: Path, options: ImportOptions) -> None:
         self.notices: list[str] = []
         self._src, self._options = src, options
@@ -144,7 +142,6 @@ class _BagReader:
         return depth_of_points(points, lens.intrinsics)
 
     def _find_images(self) -> tuple[ros_bags.Topic, ros_bags.Topic | None]:
-        """The topics of colour and of depth."""
         topics, wanted = self._bag.image_topics(), self._options.topics
         depths = [t for t in topics if t.is_depth]
         colors = [t for t in topics if t not in depths]
@@ -183,7 +180,6 @@ class _BagReader:
         return name
 
     def _info_topic(self, topic: ros_bags.Topic, role: str) -> str:
-        """The topic of the calibration of images."""
         infos = self._bag.topics(ros_bags.CAMERA_INFO)
         name = self._named(role, infos) or _info_name(topic)
         if name in infos:
@@ -229,7 +225,6 @@ class _BagReader:
         self._stamps = {name: np.array(values, np.int64) for name, values in stamps.items()}
 
     def _intrinsics(self, topic: ros_bags.Topic, info: str) -> CameraIntrinsics:
-        """Of the images of a topic."""
         unlike = {(c.model, c.size, *c.K, *c.D, *c.P): c for c in self._calibrations[info]}
         found = [c.intrinsics(f"camera_info of {topic.name}", rectified=topic.rectified) for c in unlike.values()]
         if any(k.distortion != found[0].distortion or not _one_lens(found[0], k) for k in found):

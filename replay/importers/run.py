@@ -160,7 +160,6 @@ def _lacks(src: Path, name: str) -> list[str]:
 
 
 def _what_folder(src: Path) -> str:
-    """Why a folder is not imported."""
     advice = next((_FOLDERS[name] for name in _FOLDERS if (src / name).exists()), None)
     if advice is not None:
         return advice
@@ -190,7 +189,6 @@ def _name_one(what: str, places: Sequence[Path]) -> str:
 
 
 def _what_file(src: Path) -> str:
-    """Why a file is not imported."""
     if src.suffix.lower() in _FILES:
         return _FILES[src.suffix.lower()]
     if src.suffix != LOG_SUFFIX:

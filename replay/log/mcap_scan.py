@@ -151,7 +151,6 @@ def read_payloads(fd: int, place: Place, most: int | None = None) -> list[bytes]
 
 
 def _unpack_chunk(body: bytes) -> bytes:
-    """The records of a chunk."""
     chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
     data, unpacked = chunk.data, chunk.uncompressed_size
     if chunk.compression and unpacked > MAX_UNPACKED_BYTES:

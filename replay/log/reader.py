@@ -44,8 +44,6 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class _LogFile(NamedTuple):
-    """A file that is open, and where its messages are."""
-
     path: Path
     fd: int
     found: Scan

@@ -369,7 +369,6 @@ def _focal_sigma(model: Any, camera: colmap.Camera, adjuster: Any) -> float | No
 
 
 def _squared_px(model: Any) -> float:
-    """Sum of the squared residuals."""
     return sum(point.track.length() * point.error**2 for point in model.points3D.values())
 
 

@@ -165,8 +165,6 @@ class _Lens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """The chosen model in the world of the log."""
-
     frames: dict[int, RegisteredFrame]  # by their index in the film
     seen: CameraIntrinsics  # of what was seen, with distortion
     scale: str  # how it was found; empty = unknown
@@ -176,8 +174,6 @@ class _Scene:
 
 
 class _Import:
-    """One import; its steps in order."""
-
     def __init__(self, film: Film, lens: _Lens, options: FilmOptions, folder: Path, on_progress: Progress) -> None:
         self._film, self._lens, self._options, self._folder = film, lens, options, folder
         self._progress = on_progress

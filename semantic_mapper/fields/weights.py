@@ -46,8 +46,6 @@ SHIPPED = Path(str(resources.files("semantic_mapper"))) / "weights"
 
 
 class _Recipe(msgspec.Struct):
-    """The parts of a recipe that are read here."""
-
     width: Annotated[int, msgspec.Meta(ge=4, le=MAX_WIDTH)] = DEFAULT_WIDTH
     train_stamps_ns: list[int] = []
 

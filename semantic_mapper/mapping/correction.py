@@ -409,7 +409,6 @@ def _pack(arrays: Sequence[NDArray[np.generic] | None]) -> bytes:
 
 
 def _unpack(blob: bytes) -> list[Any]:
-    """The reverse of ``_pack``."""
     arrays: list[Any] = []
     for packed in msgspec.msgpack.decode(blob, type=list[tuple[str, tuple[int, ...], bytes] | None]):
         if packed is None:

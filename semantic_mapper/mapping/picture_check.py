@@ -125,8 +125,6 @@ class PictureCheck:
 
 
 class _CameraCheck:
-    """``PictureCheck`` of one camera."""
-
     def __init__(self, intrinsics: CameraIntrinsics) -> None:
         width = min(intrinsics.width, _WIDTH)
         self.intrinsics = intrinsics

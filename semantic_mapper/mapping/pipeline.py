@@ -65,8 +65,6 @@ S = TypeVar("S", np.uint8, np.float32)
 
 
 class _FullSize(NamedTuple):
-    """A rendered view at the size (H, W) of its frame."""
-
     views: FrameViews
     depth_m: Float32
     rows: Int32
@@ -339,7 +337,6 @@ class MappingPipeline:
         return full._replace(moving=moving)
 
     def _upsample(self, views: FrameViews, view: RenderedView, voxel_map: VoxelMap) -> _FullSize:
-        """A rendered view at the size of its frame."""
         frame = views.frame
         size = (frame.intrinsics.width, frame.intrinsics.height)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
@@ -355,13 +352,11 @@ class MappingPipeline:
         return _FullSize(views, depth, rows, trust)
 
     def _fuse(self, voxel_map: VoxelMap, full: _FullSize, votes: RenderedView) -> int:
-        """Integrate a frame into a map; blocks touched."""
         frame, table = full.views.frame, votes.probabilities.reshape(-1, len(self.label_set))
         measured = is_measured(frame)
         return voxel_map.integrate(frame, full.depth_m, table, rows=full.rows, trust=full.trust, measured=measured)
 
     def _fuse_again(self, voxel_map: VoxelMap, frame: PosedFrame, view: RenderedView) -> None:
-        """Integrate a frame of the history into a map."""
         self._fuse(voxel_map, self._upsample(FrameViews(frame), view, voxel_map), view)
 
     def _follow_correction(self) -> None:

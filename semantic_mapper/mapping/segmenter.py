@@ -75,8 +75,6 @@ class SegmenterTable(Config, frozen=True):
 
 
 class _Answer(NamedTuple):
-    """What the model said of one frame."""
-
     likelihood: Float32  # (h, w, G + 1) of groups of classes, and the probability that the pixel moves
     depth_m: Float32  # (h, w)
     intrinsics: CameraIntrinsics  # of (h, w)

@@ -121,8 +121,6 @@ def open_objects(path: Path, up: ArrayLike | None = None) -> tuple[MapSnapshot, 
 
 
 class _Scene:
-    """What is needed of all objects to judge one."""
-
     def __init__(self, snapshot: MapSnapshot, objects: Sequence[MapObject], up: Float64) -> None:
         self._snapshot, self._up = snapshot, up
         self._there = [o for o in objects if o.gone_ns is None]

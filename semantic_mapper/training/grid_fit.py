@@ -188,7 +188,6 @@ class _Fitter:
         return max(round(max(self.box.shape) / self.stages[stage][1]), 8)
 
     def _allocate(self) -> None:
-        """Buffers for the grid as it is now."""
         self.adam = GridAdam(self.grid, self.rays, self.config.near_m)
         self.gradient = np.zeros_like(self.adam.values)
         self.samples = march.SampleLists.empty(self.config.rays, self.gradient.shape, 4)
@@ -270,8 +269,6 @@ class GridAdam:
 
 
 class _Adam:
-    """Adam's direction for a small array."""
-
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.first, self.second, self.count = np.zeros(shape), np.zeros(shape), 0
 

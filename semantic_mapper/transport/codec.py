@@ -447,7 +447,6 @@ def _name(header: _ImageHeader) -> str:
 
 
 def _pack(header: object, what: str) -> bytes:
-    """A header, checked as its reader will check it."""
     fields = to_plain(header, what)
     if (labels := getattr(header, "label_set", None)) is not None:
         fields["label_set"] = to_plain(LabelSetForm.of(labels), what)
