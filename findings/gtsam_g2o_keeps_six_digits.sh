@@ -46,10 +46,11 @@ def kept(origin_m, path):
 
 
 near, far = kept((0, 0, 0), sys.argv[1]), kept((500_000, 5_300_000, 100), sys.argv[1])
-kept((0, 2_000, 0), sys.argv[1])
+middle = kept((0, 2_000, 0), sys.argv[1])
 sys.exit(
     not (
         1 < far[0] < 10
+        and 1e-3 < middle[0] < 1e-2
         and np.allclose(np.unique(far[2]), (0, 10))
         and 1e-7 < far[1] < 1e-5
         and near[0] < 1e-4

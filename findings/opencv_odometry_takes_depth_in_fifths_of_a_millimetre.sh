@@ -3,7 +3,7 @@
 #        rescaleDepth of the same module do; or it has a setting for the unit.
 # Found: it divides by 5,000, the unit of TUM's recordings. A camera that moves 30 mm to the right and 50 mm ahead is
 #        said to have moved 6 and 10 mm; rotations are right, compute() says true. OdometrySettings has no unit to set.
-#        The same depth in float metres is right.
+#        The same depth in float metres gives 30 and 50 mm with RGB_DEPTH, 30 and 37 mm with DEPTH alone.
 # Seen:  opencv-contrib-python-headless 5.0.0.93, Python 3.11, Linux x86-64; types DEPTH and RGB_DEPTH.
 # Who:   users who hand it the images of a Kinect, RealSense or OAK as they are: a trajectory five times too short.
 # What to do: hand it rescaleDepth's float metres.
@@ -68,6 +68,7 @@ sideways = {key: moved[0] for key, moved in found.items()}
 sys.exit(
     bool(units)
     or any(abs(sideways[name, "float metres"] - 30) > 1.5 for name in ("DEPTH", "RGB_DEPTH"))
+    or abs(found["RGB_DEPTH", "float metres"][2] - 50) > 2
     or any(abs(sideways[name, "16 bits, mm"] - 6) > 0.3 for name in ("DEPTH", "RGB_DEPTH"))
 )
 PY

@@ -1,8 +1,8 @@
 #!/bin/sh
 # Guess: a patch release of OpenVINO runs, on every processor, what the one before ran; its CPU plugin asks for SSE4.2.
 # Found: on a processor without AVX 2026.4.1 refuses to compile an Interpolate of float32 ("bad combination"), be it
-#        "nearest" or "linear_onnx"; 2026.4.0 gives the right values. The same numbers by DepthToSpace of four copies
-#        compile with both.
+#        "nearest" or "linear_onnx"; 2026.4.0 runs both, "nearest" with the right values. The same numbers by DepthToSpace
+#        of four copies compile with both.
 # Seen:  openvino 2026.4.1 and 2026.4.0, Python 3.11, Linux x86-64, with ONEDNN_MAX_CPU_ISA=SSE41 as the stand-in for
 #        Celeron, Pentium and Atom boards without AVX.
 # Who:   users who run a segmentation network, which as a rule upsamples, on such a robot's board.

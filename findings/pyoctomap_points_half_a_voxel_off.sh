@@ -5,8 +5,7 @@
 #        one cloud has both kinds. getCoordinate() of the leaves is right. ColorOcTree has the same shift.
 # Seen:  pyoctomap 1.2.2, Python 3.11, Linux x86-64.
 # Who:   users who score or fuse an OctoMap by its points: a map is half a voxel from where it was measured.
-# What to do: take the leaves' getCoordinate(), or the voxel that holds a point less a quarter of a voxel along each
-#        axis.
+# What to do: take the leaves' getCoordinate().
 set -eu
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -5,7 +5,7 @@
 #        (65280, 32768, 16384) becomes (0, 0, 0); times 257, as other writers have it, 65535 happens to be right, and
 #        128 * 256 + 10 becomes 10. The same in a mesh's vertex colours and in what is exported; no warning.
 # Seen:  trimesh 5.2.0 with laspy 2.7.0, Python 3.11, Linux x86-64.
-# Who:   users who show scans of LAS or E57, which hold 16 bits, or write them to PLY or GLB.
+# Who:   users who show scans of LAS, which hold 16 bits, or write them to PLY.
 # What to do: hand it (colours >> 8).astype(numpy.uint8).
 set -eu
 work=$(mktemp -d)
