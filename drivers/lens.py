@@ -10,7 +10,7 @@ import numpy as np
 
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.geometry import camera_matrix
-from semantic_mapper.types import COEFFICIENTS, CameraIntrinsics, FisheyeIntrinsics, Float64
+from semantic_mapper.types import COEFFICIENTS, Bool, CameraIntrinsics, FisheyeIntrinsics, Float64
 
 # Coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty.
 _PINHOLE = (
@@ -22,9 +22,9 @@ _FISHEYE = ("equidistant", "equi", "fisheye", "opencv_fisheye", "fisheye_opencv"
 _ZERO_IS_PINHOLE = ("brown_conrady", "inverse_brown_conrady", "modified_brown_conrady", "division")
 
 MAX_INVERSE_PX = 1e-6  # by which the ray of a pixel may miss it
-_STEPS, _ROUNDS, _EXACT_PX = 16, 60, 1e-9  # on the way to a pixel; rounds at most at each step, and when one ends
+_STEPS, _ROUNDS, _EXACT_PX = 16, 60, 1e-9  # from the middle to a pixel; rounds of a step at most, and its end
 _FAR = np.tan(np.radians(65.0))  # to each side: a pinhole stretches what is beyond
-_PARTS = 0.95 ** np.arange(40)  # of a view that are tried
+_PARTS = 0.97 ** np.arange(100)  # of a view that are tried
 _EDGE = 1e-4  # of an image's width and height, by which points of its border may miss it
 
 
@@ -86,11 +86,18 @@ def undistort(pixels: Float64, lens: CameraIntrinsics) -> Float64:
                 break
             (x, y), ((xu, xv), (yu, yv)) = off.T, np.moveaxis(slant, 0, -1)
             slopes += np.stack((yv * x - xv * y, xu * y - yu * x), axis=1) / area[:, None]
-    seen, _ = _bend(slopes, lens)
-    on_the_way = np.linspace(0, 1, 16)[:, None, None] * slopes
-    rising = (_area(_bend(on_the_way.reshape(-1, 2), lens)[1]) > 0).reshape(on_the_way.shape[:2]).all(axis=0)
-    slopes[~(rising & (np.linalg.norm(seen - pixels, axis=1) <= MAX_INVERSE_PX))] = np.nan
+    off = _bend(slopes, lens)[0] - pixels
+    ahead = (slopes * (pixels - centre)).sum(axis=1) >= 0
+    slopes[~(ahead & (np.linalg.norm(off, axis=1) <= MAX_INVERSE_PX) & _before_fold(slopes, lens))] = np.nan
     return slopes
+
+
+def _before_fold(slopes: Float64, lens: CameraIntrinsics) -> Bool:
+    """Whether pixels move on with the rays (N, 2) all the way from the middle, by equal parts of the angle: (N,)."""
+    far = np.linalg.norm(slopes, axis=1, keepdims=True)
+    part = np.tan(np.linspace(0, 1, 64)[:, None, None] * np.arctan(far)) / np.where(far > 0, far, 1.0)
+    rising: Bool = _area(_bend((part * slopes).reshape(-1, 2), lens)[1]).reshape(64, -1) > 0
+    return np.asarray(rising.all(axis=0))
 
 
 def _bend(slopes: Float64, lens: CameraIntrinsics) -> tuple[Float64, Float64]:
@@ -99,7 +106,8 @@ def _bend(slopes: Float64, lens: CameraIntrinsics) -> tuple[Float64, Float64]:
     project, shifts = (cv2.fisheye.projectPoints, 11) if isinstance(lens, FisheyeIntrinsics) else (cv2.projectPoints, 3)
     coefficients = np.array(lens.distortion or (0.0,) * 4, np.float64)
     pixels, slants = project(rays, still, still, camera_matrix(lens), coefficients)[:2]
-    return np.reshape(pixels, (-1, 2)), np.reshape(slants, (len(slopes), 2, -1))[..., shifts : shifts + 2]
+    flat, moved = np.asarray(pixels, np.float64).reshape(-1, 2), np.asarray(slants, np.float64)
+    return flat, moved.reshape(len(slopes), 2, -1)[..., shifts : shifts + 2]
 
 
 def _area(slant: Float64) -> Float64:
@@ -117,15 +125,20 @@ def clear_view(lenses: Sequence[tuple[CameraIntrinsics, Float64]], width: int, h
         up, right, down, left = np.split(rays[:, :2] / rays[:, 2:], 4)  # NaN where the lens folds before its edge
         least = np.fmax(least, np.fmax.reduce((left[:, 0], up[:, 1]), axis=1))
         most = np.fmin(most, np.fmin.reduce((right[:, 0], down[:, 1]), axis=1))
-    for part in _PARTS:  # the first, but for lenses that fold
-        middle, half = (least + most) / 2, part * (most - least) / 2
+    middle, half, lens = (least + most) / 2, (most - least) / 2, lenses[0][0]
+    views = [(middle, half)]
+    if not isinstance(lens, FisheyeIntrinsics):  # its edges may tell no shape: that of its own image, twice as wide
+        own = (np.array((lens.width, lens.height)) - 1) / (lens.fx, lens.fy)
+        middle, half = own / 2 - (lens.cx / lens.fx, lens.cy / lens.fy), own
+    views += [(middle, part * half) for part in _PARTS]
+    far = np.array((width - 1, height - 1)) / 2
+    for middle, half in views:  # the first, but for lenses that fold
         rays = _ahead(_border(*(middle - half), *(middle + half)))
-        if (half > 0).all() and all(_shows(lens, rays @ R) for lens, R in lenses):
-            far = np.array((width - 1, height - 1)) / 2
-            focal = far / half
-            if isinstance(lenses[0][0], FisheyeIntrinsics):  # whose longer side reaches much farther
-                focal[:] = focal.max()
-            return CameraIntrinsics(*focal.tolist(), *(far - focal * middle).tolist(), width, height)
+        if (half > 0).all() and all(_shows(shown, rays @ R) for shown, R in lenses):
+            # The longer side of a fisheye reaches much farther.
+            focal = np.full(2, (far / half).max()) if isinstance(lens, FisheyeIntrinsics) else far / half
+            (fx, fy), (cx, cy) = focal.tolist(), (far - focal * middle).tolist()
+            return CameraIntrinsics(fx, fy, cx, cy, width, height)
     raise FrameError("no ray lies in the whole of it")
 
 
@@ -136,7 +149,6 @@ def _border(left: float, up: float, right: float, down: float) -> Float64:
 
 
 def _ahead(slopes: Float64) -> Float64:
-    """Rays (N, 3) of slopes (N, 2)."""
     return np.pad(slopes, ((0, 0), (0, 1)), constant_values=1.0)
 
 
@@ -145,4 +157,4 @@ def _shows(lens: CameraIntrinsics, rays: Float64) -> bool:
     slopes = rays[:, :2] / rays[:, 2:]
     pixels, _ = _bend(slopes, lens)
     inside = (np.abs(pixels / (np.array((lens.width, lens.height)) - 1) - 0.5) < 0.5 + _EDGE).all()
-    return bool(inside and np.abs(undistort(pixels, lens) - slopes).max() < MAX_INVERSE_PX)
+    return bool(inside and _before_fold(slopes, lens).all())

@@ -301,6 +301,7 @@ def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
 
 
 def _percentiles(times: LatencyHistogram) -> dict[str, float | None]:
+    """Median and 95th percentile, null for nothing."""
     return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
 
 

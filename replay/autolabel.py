@@ -322,7 +322,6 @@ class _Labeller:
             self._set_label(message, None)
 
     def _add_depth(self, message: _Message, frame: PosedFrame) -> None:
-        """Computed depth and its spread."""
         depth_m, sigma_m = frame.depth_m, frame.depth_sigma_m
         assert depth_m is not None and sigma_m is not None
         if self._pipeline.voxel_map.scale_known:

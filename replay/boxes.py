@@ -217,7 +217,6 @@ def _stamps(known: list[tuple[int, Pose]] | None) -> tuple[tuple[int, Float64], 
 
 
 def _from_query(entry: Any, margin_m: float) -> dict[str, Any]:
-    """One instance of `query MAP instances`."""
     thing = convert_config(entry, _Instance, "an instance, as `query MAP instances` writes it")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.array(thing.box.R_world_box), thing.box.center

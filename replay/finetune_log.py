@@ -125,7 +125,6 @@ def _finetune_labels(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Che
 
 
 def _finetune_boxes(request: FinetuneRequest, monitor: JobMonitor) -> tuple[Checkpoint, list[int]]:
-    """A field of kind "panoptic"."""
     assert request.boxes is not None
     boxes = load_boxes(request.boxes, query_margin_m=QUERY_MARGIN_M)
     with open_log(request.log) as log:

@@ -149,39 +149,41 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
     scale = max(width / size[0], height / size[1])
     K = scale * np.array(K)
     K[:2, 2] -= (scale * np.array(size) - (width, height)) / 2
-    return CameraIntrinsics(*K.diagonal()[:2].tolist(), *K[:2, 2].tolist(), width, height)
+    return CameraIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
 
 
 def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
     """Intrinsics that a message carries: the calibration's, after every crop and scaling that the device has made.
 
-    None where it carries none; ``FrameError`` where they do not fit the image.
+    None where it carries none. Raises FrameError: they do not fit the image. CameraError: it is mirrored.
     """
     transformation = frame.getTransformation()
     K = np.array(transformation.getIntrinsicMatrix(), np.float64)
     focal = np.linalg.norm(K[:2, :2], axis=1)  # also of a picture that was turned or mirrored
     if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not focal.all():
         return None
-    return CameraIntrinsics(*focal.tolist(), *K[:2, 2].tolist(), *transformation.getSize())
+    if np.linalg.det(K[:2, :2]) < 0:
+        raise CameraError(
+            "the OAK mirrors its pictures, and the map would be mirrored: leave its image orientation alone"
+        )
+    return CameraIntrinsics(float(focal[0]), float(focal[1]), float(K[0, 2]), float(K[1, 2]), *transformation.getSize())
 
 
 def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:
     """What two messages say against it that they are undistorted and show the same pixels."""
-    if any(rgb.getTransformation().getDistortionCoefficients()):
+    first, ours = rgb.getTransformation(), reported_intrinsics(rgb)
+    theirs = None if depth is None else reported_intrinsics(depth)
+    if any(first.getDistortionCoefficients()):
         return ["the device says that its images are not undistorted: surfaces may bend"]
-    ours, theirs = reported_intrinsics(rgb), None if depth is None else reported_intrinsics(depth)
-    if ours is None:
-        return []
-    first = rgb.getTransformation()
-    (a, b), (c, d) = np.array(first.getIntrinsicMatrix())[:2, :2]
-    turned = "the device turns or mirrors its pictures: poses of its own tracking are of those before"
-    troubles = [turned] if min(a, d) <= 0 or max(abs(b), abs(c)) > ALIGNED_PX else []
-    if theirs is None:
+    troubles: list[str] = []
+    if ours and np.abs(np.array(first.getIntrinsicMatrix())[:2, :2] - np.diag((ours.fx, ours.fy))).max() > ALIGNED_PX:
+        troubles.append("the device turns its pictures: poses of its own tracking are of those before")
+    if depth is None or ours is None or theirs is None:
         return troubles
     a, b = (np.array((k.fx, k.fy, k.cx, k.cy, k.width, k.height)) for k in (ours, theirs))
+    misaligned = "depth may not be aligned with colour: the device says"
     if np.abs(a - b).max() > ALIGNED_PX:
-        both = f"{theirs} of the one and {ours} of the other"
-        troubles.append(f"depth may not be aligned with colour: the device says {both}")
+        troubles.append(f"{misaligned} {theirs} of the one and {ours} of the other")
     try:  # not compared by isAlignedTo
         meter = load_depthai().LengthUnit.METER
         T = np.array(first.getExtrinsicsTransformationMatrixTo(depth.getTransformation(), sourceUnit=meter))
@@ -189,8 +191,7 @@ def geometry_troubles(rgb: Any, depth: Any | None) -> list[str]:
         return troubles
     apart_m, apart_deg = np.linalg.norm(T[:3, 3]), np.degrees(np.linalg.norm(rotation_vector(T)))
     if apart_m > ALIGNED_M or apart_deg > ALIGNED_DEG:
-        apart = f"{1000 * apart_m:.0f} mm and {apart_deg:.1f} degrees apart"
-        troubles.append(f"depth may not be aligned with colour: the device says that they are {apart}")
+        troubles.append(f"{misaligned} that they are {1000 * apart_m:.0f} mm and {apart_deg:.1f} degrees apart")
     return troubles
 
 

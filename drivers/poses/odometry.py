@@ -248,7 +248,6 @@ class OdometryPoseSource(PoseSource):
         return sorted(guesses, key=lambda T: fit(view.levels, self._graph.near(T, 1)[0].target, T).cost_m)
 
     def _expected(self, stamp_ns: int) -> Float64:
-        """Where the last motion leads."""
         if len(self._past) < 2:
             return self._past[-1].T
         a, b = self._past

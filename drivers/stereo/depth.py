@@ -46,7 +46,7 @@ class StereoDepth:
         R_left, R_right = cv2.stereoRectify(
             *lenses[0], *lenses[1], (left.width, left.height), pair.T_right_left[:3, :3], offset.reshape(3, 1)
         )[:2]
-        turned = [(left, np.asarray(R_left)), (right, np.asarray(R_right))]
+        turned = [(left, np.asarray(R_left, np.float64)), (right, np.asarray(R_right, np.float64))]
         try:  # OpenCV's own view may reach beyond the images
             self.intrinsics = clear_view(turned, *size)
         except FrameError as error:

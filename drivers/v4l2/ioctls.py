@@ -112,7 +112,6 @@ def list_formats(fd: int) -> tuple[str, ...]:
 
 
 def _rows(fd: int, request: int, row_of: Callable[[int], Any]) -> Iterator[Any]:
-    """Rows of a list, filled in, to its end."""
     for index in range(_MAX_ROWS):
         row = row_of(index)
         try:

@@ -213,7 +213,6 @@ class _Refused(logging.Handler):
         self.ids: set[int] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """A line of the SDK's log, from one of its threads."""
         if said := re.search(r"unknown channel: (\d+)", record.getMessage()):
             self.ids = {*sorted(self.ids)[-MAX_REFUSED:], int(said[1])}
 

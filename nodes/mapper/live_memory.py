@@ -100,7 +100,6 @@ class LiveMemory(Closing):
         return on_time and self._is_of != (self._map.version, self._up)
 
     def _collect(self) -> None:
-        """Note that the update that ran has ended."""
         if self._running is not None and self._running.done():
             self._last, self._running, self._is_of = self._running, None, self._begun
             if not isinstance(error := self._last.exception(), SemanticMapperError | None):

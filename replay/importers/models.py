@@ -55,6 +55,7 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
 
 
 def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
+    """The model of most images; the others are named."""
     places = find_models(folder)
     if not places:
         raise ImportSourceError(f"{folder}: no COLMAP model (cameras, images and points3D, .bin or .txt) in it")
@@ -72,6 +73,8 @@ def _largest(folder: Path, notices: list[str]) -> tuple[Path, ColmapModel]:
 
 
 class _Camera(msgspec.Struct):
+    """Of OpenSfM."""
+
     width: float
     height: float
     projection_type: str = "perspective"

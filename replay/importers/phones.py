@@ -42,6 +42,8 @@ _RECORD3D_KNOWN = ("dw", "dh", "initPose", "cameraType")  # of the depth images,
 
 
 class _Camera(msgspec.Struct):
+    """Of Polycam, with the numbers of ``_Pose``."""
+
     fx: float
     fy: float
     cx: float

@@ -389,7 +389,6 @@ def _several(role: str, topics: list[str], first: str) -> ImportSourceError:
 
 
 def _info_name(topic: ros_bags.Topic) -> str:
-    """Where the calibration of images is."""
     return f"{topic.base.rsplit('/', 1)[0]}/camera_info"
 
 

@@ -303,6 +303,7 @@ def refuse_keys(table: Mapping[str, Any], names: re.Pattern[str], where: object)
 
 
 def _is_neutral(key: str, value: Any) -> bool:
+    """Whether a value says that nothing is changed."""
     if isinstance(value, str):
         return value.strip().lower() in _NEUTRAL_WORDS and not _AXES.search(key)
     if isinstance(value, Mapping):

@@ -48,6 +48,8 @@ _Matrix = Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
 
 
 class _Lens(msgspec.Struct, kw_only=True):
+    """Of a frame, or of all of them."""
+
     camera_model: str | None = None
     is_fisheye: bool | None = None
     camera_angle_x: float | None = None

@@ -134,12 +134,6 @@ def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
     return nearest(good) if good.sum() >= max(2, MIN_RAY_FRACTION * len(rays)) else None
 
 
-def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
-    """Origin and unit direction in the world of a pixel (2,) of an image with distortion; NaN: it has no ray."""
-    direction = T_world_camera[:3, :3] @ np.array((*undistort(xy[None], intrinsics)[0], 1.0))
-    return T_world_camera[:3, 3], direction / np.linalg.norm(direction)
-
-
 def scale_by_board(
     seen: Sequence[tuple[int, Float64, Float64]], poses: Mapping[int, Float64], intrinsics: CameraIntrinsics
 ) -> tuple[float, str]:
@@ -151,9 +145,12 @@ def scale_by_board(
     rays: dict[tuple[float, ...], list[tuple[Float64, Float64]]] = {}
     posed = [row for row in seen if row[0] in poses]
     for index, points, pixels in posed:
-        for point, xy in zip(points, pixels, strict=True):
-            if np.isfinite((ray := ray_of(poses[index], xy, intrinsics))[1]).all():
-                rays.setdefault(tuple(np.round(point, 6)), []).append(ray)
+        T, slopes = poses[index], undistort(pixels, intrinsics)
+        ahead = np.column_stack((slopes, np.ones(len(slopes)))) @ T[:3, :3].T
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        for point, direction in zip(points, ahead, strict=True):
+            if np.isfinite(direction).all():  # not beyond the fold of a lens
+                rays.setdefault(tuple(np.round(point, 6)), []).append((T[:3, 3], direction))
     corners = {corner: place for corner, of in rays.items() if (place := triangulate(of)) is not None}
     if len(corners) < MIN_BOARD_CORNERS:
         raise ImportSourceError(

@@ -38,7 +38,6 @@ VARIANTS: dict[str, dict[str, str]] = {  # name -> environment
     "OpenVINO for SSE4.1": {"ONEDNN_MAX_CPU_ISA": "SSE41"},
     "encoder by torch": {},
     "encoder by ONNX Runtime": {},
-    "the other OpenCV": {},
 }
 
 
@@ -85,7 +84,9 @@ def differing(first: Path, second: Path) -> str:
     with np.load(first) as a, np.load(second) as b:
         for name in {name for name in (*a.files, *b.files) if "/" in name}:
             one, other = (np.asarray(archive.get(name, ())) for archive in (a, b))
-            counts[name[7:]] += int((one != other).sum()) if one.shape == other.shape else max(one.size, other.size)
+            one, other = (array.view(f"u{array.itemsize}") for array in (one, other))  # bits: NaN is NaN, and 0 not -0
+            kind = name.split("/")[1]
+            counts[kind] += int((one != other).sum()) if one.shape == other.shape else max(one.size, other.size)
     return ", ".join(f"{count:,} of {name}" for name, count in sorted(counts.items()) if count) or "none: the same bits"
 
 
@@ -101,22 +102,20 @@ def main() -> None:
         print(json.dumps(map_log(options.only[0], options.log, options.frames, Path(options.only[1]))))
         return
     print("| variant | numbers of the map that differ | mIoU | surface, p95 | other labels |")
+    other = {"the other OpenCV": {"PYTHONPATH": options.opencv}} if options.opencv else {}
     with tempfile.TemporaryDirectory() as temporary:
         first: Path | None = None
-        for number, (variant, given) in enumerate(VARIANTS.items()):
+        for number, (variant, given) in enumerate({**VARIANTS, **other}.items()):
             folder = Path(temporary) / str(number)
             folder.mkdir()
             environment = {**os.environ, "OMP_NUM_THREADS": "1", **given}
-            if variant == "the other OpenCV":
-                environment["PYTHONPATH"] = options.opencv
             command = [sys.executable, "-m", "research.bench.exact", options.log, "--frames", str(options.frames)]
             said = subprocess.check_output([*command, "--only", variant, str(folder)], env=environment, text=True)
             first = first or folder
-            compared = compare_runs(read_run(first / "map.npz"), read_run(folder / "map.npz"), Tolerances())
+            maps = first / "map.npz", folder / "map.npz"
+            compared = compare_runs(read_run(maps[0]), read_run(maps[1]), Tolerances())
             figures = {figure.name: figure.difference or 0.0 for figure in compared.figures}
-            row = (
-                f"{differing(first / 'map.npz', folder / 'map.npz')} | {100 * json.loads(said.splitlines()[-1]):.2f} %"
-            )
+            row = f"{differing(*maps)} | {100 * json.loads(said.splitlines()[-1]):.2f} %"
             row += f" | {1e3 * figures['surface_m']:.3f} mm | {100 * figures['labels']:.3f} % |"
             print(f"| {variant} | {row}", flush=True)
 

@@ -41,6 +41,8 @@ class RefinedPose:
 
 @dataclass(slots=True, eq=False)
 class _Frame:
+    """A frame whose pose may still change."""
+
     key: tuple[str, int]
     keyframe: keyframes.Keyframe
     T_keyframe_camera: Float64
@@ -167,6 +169,7 @@ class PoseRefiner:
             frame.T_keyframe_camera, frame.tracks = invert_pose(frame.keyframe.T_world_camera) @ found[0], None
 
     def _adjust(self) -> None:
+        """Bundle now, or in the worker where that is free."""
         problem = None if self._pending is not None else self._map.bundle()
         if problem is None:
             return

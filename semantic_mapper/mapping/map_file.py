@@ -422,4 +422,5 @@ def _explained(what: str) -> Iterator[None]:
 
 
 def _comment(manifest: bytes) -> bytes:
+    """Of the zip."""
     return _COMMENT + hashlib.sha256(manifest).hexdigest().encode()

@@ -352,6 +352,7 @@ class MappingPipeline:
         return _FullSize(views, depth, rows, trust)
 
     def _fuse(self, voxel_map: VoxelMap, full: _FullSize, votes: RenderedView) -> int:
+        """Integrate a frame into a map; blocks touched."""
         frame, table = full.views.frame, votes.probabilities.reshape(-1, len(self.label_set))
         measured = is_measured(frame)
         return voxel_map.integrate(frame, full.depth_m, table, rows=full.rows, trust=full.trust, measured=measured)

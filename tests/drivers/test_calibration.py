@@ -145,6 +145,8 @@ def test_a_pixel_that_a_lens_gives_to_no_ray_has_none() -> None:
     folded = CameraIntrinsics(800.0, 800.0, 639.5, 479.5, 1280, 960, (-0.6, 0.0, 0.0, 0.0))
     slopes = undistort(np.array([(0.0, 0.0), (700.0, 500.0)]), folded)
     assert np.isnan(slopes[0]).all() and np.abs(slopes[1]).max() < 0.1
+    fisheye = FisheyeIntrinsics(207.0, 207.0, 319.5, 239.5, 640, 480, (-0.0093, 0.0058, -0.0544, -0.0345))
+    assert np.isnan(undistort(np.array([(0.0, 207.6)]), fisheye)).all()  # or it is on the other side of the picture
     with pytest.raises(FrameError, match="gives pixel 0, 0 to no ray; calibrate again"):
         ideal_pixels(np.zeros((1, 2)), folded)
 
@@ -160,6 +162,9 @@ def test_rectified_images_show_nothing_from_beside_the_image(focal: float, disto
     assert rectify(white).min() > 250
     folds = bool(np.isnan(undistort(np.zeros((1, 2)), lens)).any())
     assert folds == (distortion[0] == -0.3)
+    if folds:  # square pixels, out to where it folds
+        reach = np.hypot(639.5 / rectify.intrinsics.fx, 479.5 / rectify.intrinsics.fy)
+        assert rectify.intrinsics.fx == pytest.approx(rectify.intrinsics.fy) and reach > 0.95 / np.sqrt(3 * 0.3)
     if not folds:  # and no more is cut off than has to be
         x, y = np.meshgrid(*(np.linspace(0, size - 1, 65) for size in (1280, 960)))
         rays = (np.stack((x, y), -1).reshape(-1, 2) - camera_matrix(rectify.intrinsics)[:2, 2]) / (

@@ -87,12 +87,14 @@ def test_intrinsics_that_the_images_carry_count_more_than_the_calibration(calibr
 
 
 def test_depth_of_a_camera_elsewhere_and_turned_pictures_are_said() -> None:
-    def seen(x_cm: float = 0.0, turned_deg: float = 0.0) -> dai.ImgFrame:
+    def seen(x_cm: float = 0.0, turned_deg: float = 0.0, *, mirrored: bool = False) -> dai.ImgFrame:
         shown, pose = dai.ImgTransformation(WIDTH, HEIGHT, [[70.0, 0, 30], [0, 70, 20], [0, 0, 1]]), dai.Extrinsics()
         shown.addRotation(turned_deg, dai.Point2f(WIDTH / 2, HEIGHT / 2))
         pose.rotationMatrix, pose.translation = np.eye(3).tolist(), dai.Point3f(x_cm, 0, 0)
         pose.lengthUnit, pose.toCameraSocket = dai.LengthUnit.CENTIMETER, dai.CameraBoardSocket.CAM_A
         shown.setExtrinsics(pose)
+        if mirrored:
+            shown.addFlipHorizontal()
         frame = dai.ImgFrame()
         frame.setTransformation(shown)
         return frame
@@ -102,7 +104,9 @@ def test_depth_of_a_camera_elsewhere_and_turned_pictures_are_said() -> None:
     assert "not be aligned" in trouble and "75 mm and 0.0 degrees apart" in trouble
     turned = seen(turned_deg=180)
     (trouble,) = geometry_troubles(turned, turned)
-    assert "turns or mirrors" in trouble
+    assert "turns its pictures" in trouble
+    with pytest.raises(CameraError, match="mirrors"):
+        geometry_troubles(seen(mirrored=True), None)
     lens = reported_intrinsics(turned)
     assert lens is not None and np.allclose((lens.fx, lens.fy, lens.cx, lens.cy), (70, 70, WIDTH - 30, HEIGHT - 20))
 
