@@ -79,8 +79,6 @@ _log = get_logger(__name__)
 
 @dataclass(eq=False)
 class _View:
-    """An image, thinned out."""
-
     stamp_ns: int
     rgb: UInt8
     depth_m: Float32

@@ -243,7 +243,8 @@ class BlockGrid:
         for start in range(0, max(len(everything), 1), TILE_BLOCKS):
             part = everything[start : start + TILE_BLOCKS]
             around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
-            tile = self.holding(around[np.isin(around, everything)])
+            at = np.searchsorted(everything[:-1], around)
+            tile = self.holding(around[everything[at] == around])
             yield unpack_keys(part), find_blocks(tile.index, part), tile
 
     def holding(self, packed: Int64) -> BlockGrid:
