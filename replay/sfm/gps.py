@@ -126,8 +126,8 @@ def place_by_gps(T_model_camera: Float64, positions: Sequence[GpsPosition | None
         raise ImportSourceError("the GPS positions are one and the same")
     inside = _consensus(centers, truth)
     length, width, _ = np.linalg.svd(centers[inside] - centers[inside].mean(axis=0), compute_uv=False)
-    if width < MIN_WIDTH * length:
-        raise ImportSourceError("the pictures that GPS agrees with lie on a line, and it tells no roll about that")
+    if width <= MIN_WIDTH * length:
+        raise ImportSourceError("pictures that fit GPS lie on a line, about which it tells no roll; take some off it")
     T, scale = align_similar(centers[inside], truth[inside])
     error_m = float(np.median(_errors(T, scale, centers, truth)))
     if error_m > MAX_ERROR * spread_m:
