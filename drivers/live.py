@@ -247,6 +247,7 @@ class CaptureDevice(Device):
         """There was no image; raises ``CameraError`` where there will be no more."""
 
     def _stamp_ns(self, arrived_ns: int) -> int:
+        """When the last image was captured."""
         raise NotImplementedError
 
 

@@ -163,9 +163,7 @@ def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
     if not transformation.isValid() or np.array_equal(K, np.eye(3)) or not focal.all():
         return None
     if np.linalg.det(K[:2, :2]) < 0:
-        raise CameraError(
-            "the OAK mirrors its pictures, and the map would be mirrored: leave its image orientation alone"
-        )
+        raise CameraError("the OAK mirrors its pictures, and so the map: leave its image orientation alone")
     return CameraIntrinsics(float(focal[0]), float(focal[1]), float(K[0, 2]), float(K[1, 2]), *transformation.getSize())
 
 

@@ -251,6 +251,7 @@ class PoseOutlierFilter:
         return [(frame, "", "") for frame in held]
 
     def _refusal(self, last: StampedPose, sample: StampedPose) -> str:
+        """Why a pose is refused; empty where it passes."""
         if self._elsewhere is not None and not self._jump(self._elsewhere, sample):
             self._elsewhere = sample
             moved_m, turned_deg = apart(last.T, sample.T)

@@ -116,6 +116,7 @@ class OdometrySessions:
         return f"its place in the map is not known: {self.reason}"
 
     def _at(self, frame: PosedFrame) -> PosedFrame:
+        """A frame of a known world."""
         pose = move(self.known[frame.world], frame.T_world_camera)
         self.reason = ""
         in_map = move(self._corrector.motion(frame.world), pose)
